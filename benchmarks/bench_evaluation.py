@@ -6,7 +6,6 @@ of all threads and wall-clock seconds are listed; on a busy machine only the for
 
 import argparse
 import json
-import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +17,6 @@ from rich.table import Table
 from sceneprior.apps.config import load_run
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
-from sceneprior.render.offscreen import open_renderer
 
 T = TypeVar("T")
 
@@ -33,9 +31,8 @@ def measure(work: Callable[[], T]) -> tuple[T, dict[str, float]]:
     }
 
 
-def time_evaluation(run: Path, shards: Path | None, count: int, renderer: str) -> dict[str, Any]:
-    """Seconds of synthesis, and of scoring without a reference file, while writing one, and with
-    the file; each value is also printed once it is measured."""
+def time_evaluation(run: Path, shards: Path | None, count: int) -> dict[str, Any]:
+    """Seconds of synthesis and of scoring; each value is also printed once it is measured."""
     seconds: dict[str, Any] = {}
 
     def timed(name: str, work: Callable[[], T]) -> T:
@@ -46,22 +43,17 @@ def time_evaluation(run: Path, shards: Path | None, count: int, renderer: str) -
     trained = timed("load", lambda: load_run(run))
     folder = shards or Path(trained.config.data.shards)
     scenes = timed("synthesize", lambda: sample_rooms(trained, count, seed=0))
-    screen = open_renderer(renderer)
 
     def score(name: str, **options: Any) -> None:
         timed(
             name,
-            lambda: evaluate_synthesis(scenes, folder, EvalOptions(renderer=screen, **options)),
+            lambda: evaluate_synthesis(scenes, folder, EvalOptions(**options)),
         )
 
-    warm = EvalOptions(renderer=screen, resamples=0)
+    warm = EvalOptions(resamples=0)
     evaluate_synthesis(scenes[:2], folder, warm)  # compiles, loads, warms
     score("score")
-    with tempfile.TemporaryDirectory() as scratch:
-        path = Path(scratch) / "reference.npz"
-        score("write_reference", reference=path)
-        score("score_with_reference", reference=path)
-        score("without_intervals", reference=path, resamples=0)
+    score("without_intervals", resamples=0)
     return seconds
 
 
@@ -71,10 +63,9 @@ def main() -> None:
     parser.add_argument("--run", type=Path, required=True)
     parser.add_argument("--shards", type=Path)
     parser.add_argument("-n", "--count", type=int, default=1000)
-    parser.add_argument("--renderer", default="auto")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
-    seconds = time_evaluation(arguments.run, arguments.shards, arguments.count, arguments.renderer)
+    seconds = time_evaluation(arguments.run, arguments.shards, arguments.count)
     table = Table(title=f"Evaluating {arguments.count} rooms")
     for heading in ("", "CPU s", "wall s"):
         table.add_column(heading, justify="right" if heading else "left")

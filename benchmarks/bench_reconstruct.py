@@ -28,7 +28,7 @@ from sceneprior.core.overlaps import box_iou_3d
 from sceneprior.lifted.reconstruction.known_rooms import known_rooms, nearest_answers
 from sceneprior.paper.fit_image import SCHEDULES, fit_latents_to_images
 from sceneprior.paper.trained import TrainedPrior
-from sceneprior.render.offscreen import open_renderer
+from sceneprior.render.offscreen import SoftwareRenderer
 
 FULL = SCHEDULES["paper"].steps
 
@@ -94,7 +94,7 @@ def main() -> None:
         many = times * cpu_seconds(partial(way, images)) / len(images)
         print(f"{name:24s} alone {alone:7.2f}   in a batch {many:7.2f}   {alone / many:5.1f} x")
     found = [one.scene.objects for one in reconstruct(trained, images, FitOptions())]
-    nearest = nearest_answers(known_rooms(given.shards), images, open_renderer("auto"))
+    nearest = nearest_answers(known_rooms(given.shards), images, SoftwareRenderer())
     ours, known = (
         mean_iou(images, answers, given.shards)
         for answers in (found, [one.objects for one in nearest])

@@ -16,7 +16,6 @@ from sceneprior.apps.config import load_any_run
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.evaluation.layout_distance import nearest_room
-from sceneprior.render.offscreen import open_renderer
 from sceneprior.render.pictures import contact_sheet
 from sceneprior.render.topdown import corner_view, perspective
 
@@ -30,18 +29,16 @@ def main() -> None:
     options.add_argument("--sheet", type=Path, required=True, help="where the picture goes (PNG)")
     options.add_argument("--distribution", help="of the rooms (default: the run's)")
     options.add_argument("--seed", type=int, default=0)
-    options.add_argument("--renderer", default="auto")
     given = options.parse_args()
     trained = load_any_run(given.run)
     drawn = sample_rooms(trained, PAIRS, given.seed, given.distribution)
     training = reference_scenes(Path(trained.config.data.shards), "train")
-    renderer = open_renderer(given.renderer)
     tiles, distances = [], []
     for scene in drawn:
         row, distance = nearest_room(scene, training)
         distances.append(distance)
         for room in (scene, training[row]):
-            tiles.append(perspective(room, renderer, view=corner_view([room], TILE_PX)))
+            tiles.append(perspective(room, view=corner_view([room], TILE_PX)))
     Image.fromarray(contact_sheet(tiles, COLUMNS, gap_px=4)).save(given.sheet, optimize=True)
     print(
         f"{PAIRS} rooms (from: {given.distribution or trained.distribution}, seed {given.seed}); "

@@ -21,7 +21,6 @@ from sceneprior.core.scene import Scene
 from sceneprior.evaluation.features import Drawing
 from sceneprior.evaluation.metrics.frechet import frechet_distance
 from sceneprior.evaluation.room_sets import without_void
-from sceneprior.render.offscreen import open_renderer
 
 DISTRIBUTIONS = ("kernel", "paper")
 
@@ -34,7 +33,7 @@ def main() -> None:
     for name in parser.parse_args().runs:
         trained = load_run(name)
         shards = Path(trained.config.data.shards)
-        drawing = Drawing(trained.config.label_set, open_renderer("auto"))
+        drawing = Drawing(trained.config.label_set)
 
         def features(scenes: Sequence[Scene], drawing=drawing) -> np.ndarray:
             known = [without_void(scene) for scene in scenes]

@@ -35,7 +35,6 @@ from sceneprior.evaluation.metrics.frechet import FRECHET
 from sceneprior.evaluation.metrics.mesh_metrics import f_score, sample_surface
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
 from sceneprior.paper.trained import TrainedPrior
-from sceneprior.render.offscreen import open_renderer
 from sceneprior.render.pictures import contact_sheet
 from sceneprior.render.topdown import box_mesh, corner_view, perspective
 
@@ -134,14 +133,12 @@ def distances(
     return found
 
 
-def figures(
-    pairs: list[tuple[Scene, Scene]], shards: Path, renderer: str
-) -> dict[str, float | None]:
+def figures(pairs: list[tuple[Scene, Scene]], shards: Path) -> dict[str, float | None]:
     """3D box IoU of decoded training rooms, and Frechet distances to the test rooms.
 
     The distances, in EfficientNet-Lite0 features, are of the decoded and the true training rooms.
     """
-    options = EvalOptions(renderer=renderer, resamples=0)
+    options = EvalOptions(resamples=0)
     scores = evaluate_synthesis([decoded for decoded, _ in pairs], shards, options)
     key = FRECHET["effnet_lite0"]
     return {
@@ -151,15 +148,14 @@ def figures(
     }
 
 
-def sheet(pairs: list[tuple[Scene, Scene]], renderer: str) -> Image.Image:
+def sheet(pairs: list[tuple[Scene, Scene]]) -> Image.Image:
     """Contact sheet of random training rooms, each with its decoded version to the right."""
     rows = np.random.default_rng(0).permutation(len(pairs))[:SHEET_ROOMS]
-    opened = open_renderer(renderer)
     tiles = []
     for row in sorted(rows):
         decoded, truth = pairs[row]
         view = corner_view([truth], TILE_PX)
-        tiles += [perspective(scene, opened, view=view) for scene in (truth, decoded)]
+        tiles += [perspective(scene, view=view) for scene in (truth, decoded)]
     return Image.fromarray(contact_sheet(tiles, SHEET_COLUMNS, gap_px=4))
 
 
@@ -183,7 +179,6 @@ def main() -> None:
     options.add_argument("--rooms", type=int, help="rooms compared by surface (default: all)")
     options.add_argument("--json", type=Path, help="file for five of the numbers")
     options.add_argument("--sheet", type=Path, help="file for a picture of 24 rooms (PNG)")
-    options.add_argument("--renderer", default="auto")
     given = options.parse_args()
     trained = load_run(given.run)
     shards = Path(trained.config.data.shards)
@@ -217,7 +212,7 @@ def main() -> None:
     print("\nVolumetric IoU by class:")
     print_by_class(rows, lambda item: item.volume_iou)
     if given.sheet:
-        sheet(shaped, given.renderer).save(given.sheet, optimize=True)
+        sheet(shaped).save(given.sheet, optimize=True)
     if given.json:
         ours = mean(item.chamfer_m for item in rows["the decoded meshes"])
         volumes = mean(item.volume_iou for item in rows["the decoded meshes"])
@@ -225,7 +220,7 @@ def main() -> None:
             "chamfer_over_ellipsoid": ours / base,
             "volume_iou": volumes,
         }
-        scores |= figures(shaped, shards, given.renderer)
+        scores |= figures(shaped, shards)
         print(scores)
         given.json.write_text(json.dumps(scores, indent=1) + "\n")
 

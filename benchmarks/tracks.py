@@ -46,7 +46,7 @@ def shuffled(views: RoomViews, noisy: bool, seed: int) -> Frames:
         class_of = {k + 1: int(name) for k, name in enumerate(views.object_class)}
         if noisy:
             image, class_of = _spoilt(image, class_of, void, rng)
-            poses[view] = _moved(poses[view], rng)
+            poses[view] = moved(poses[view], rng)
         ids[view][image == void] = UNKNOWN
         numbers = [k for k in np.unique(image).tolist() if k not in (0, void)]
         for k in rng.permutation(numbers).tolist():
@@ -90,7 +90,7 @@ def _numbers(image: np.ndarray, void: int) -> list[int]:
     return [k for k in np.unique(image).tolist() if k not in (0, void)]
 
 
-def _moved(pose: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def moved(pose: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """A camera turned about a random axis and moved in a random direction."""
     axis, way = (vector / np.linalg.norm(vector) for vector in rng.normal(size=(2, 3)))
     cross = np.cross(np.eye(3), axis)

@@ -16,7 +16,15 @@ if TYPE_CHECKING:
 
 def add_commands(app: typer.Typer) -> None:
     """Mount the prep-* commands, inspect and make-homes."""
-    for command in (make_homes, prep_front, recipe, prep_scannet, prep_posed, inspect):
+    for command in (
+        make_homes,
+        prep_front,
+        recipe,
+        prep_scannet,
+        prep_posed,
+        prep_dataset,
+        inspect,
+    ):
         app.command()(command)
 
 
@@ -27,13 +35,9 @@ OutOption = Annotated[Path, typer.Option(help="Folder for the shards.")]
 WorkersOption = Annotated[
     int | None, typer.Option(min=1, help="Processes on this machine (default: all cores).")
 ]
-SchedulerOption = Annotated[
-    str | None, typer.Option(help="Run on a Dask cluster instead: tcp://HOST:8786.")
-]
 SeedOption = Annotated[
     int, typer.Option(min=0, max=LARGEST_SEED, help="The same seed writes the same bytes.")
 ]
-StrictOption = Annotated[bool, typer.Option("--strict", help="Stop at the first failed room.")]
 RetryOption = Annotated[
     bool, typer.Option("--retry-failed", help="Try rooms again that failed in an earlier run.")
 ]
@@ -82,12 +86,10 @@ def prep_front(
         bool, typer.Option("--rgb", help="Also write shaded pictures, OUT/rgb/ROOM/VIEW.png.")
     ] = False,
     workers: WorkersOption = None,
-    scheduler: SchedulerOption = None,
     renderer: Annotated[str, typer.Option(help="auto, pyrender or software.")] = "auto",
     only: Annotated[
         str | None, typer.Option(help="One house or room only: HOUSE, HOUSE/ROOM or a room id.")
     ] = None,
-    strict: StrictOption = False,
     retry_failed: RetryOption = False,
 ) -> None:
     """Turn houses in 3D-FRONT's format into view shards. The same command resumes a stopped run.
@@ -103,7 +105,7 @@ def prep_front(
         changes.append(f"views.per_m2={views_per_m2}")
     rules = load_recipe(recipe, tuple(changes))
     source = FrontSource(front, future, rules, splits, seed, only, rgb)
-    run_job(Job(source, out, workers, scheduler, renderer, strict, retry_failed))
+    run_job(Job(source, out, workers, renderer, retry_failed))
 
 
 def recipe(
@@ -138,9 +140,7 @@ def prep_scannet(
     ] = None,
     seed: SeedOption = 0,
     workers: WorkersOption = None,
-    scheduler: SchedulerOption = None,
     only: Annotated[str | None, typer.Option(help="A scan, or a prefix of scans' names.")] = None,
-    strict: StrictOption = False,
     retry_failed: RetryOption = False,
 ) -> None:
     """Turn ScanNet's recordings into view shards, straight from .sens and the zips.
@@ -154,15 +154,13 @@ def prep_scannet(
     size = FULL_SIZE if full_size else QUARTER_SIZE
     settings = ScanSettings(frame_step, max_views, masks, size)
     source = ScanNetSource(scans, labels, settings, train_list, val_list, seed, only)
-    run_job(Job(source, out, workers, scheduler, "auto", strict, retry_failed))
+    run_job(Job(source, out, workers, "auto", retry_failed))
 
 
 def prep_posed(
     rooms: Annotated[
         Path,
-        typer.Argument(
-            help="A room's folder (transforms.json, or COLMAP's sparse/0), or a folder of such."
-        ),
+        typer.Argument(help="A room's folder (its poses and masks), or a folder of such."),
     ],
     out: OutOption,
     label_set: Annotated[
@@ -171,11 +169,19 @@ def prep_posed(
             help="Classes: a file with one per line, a list (void,bed,chair), or a set's name."
         ),
     ],
+    tools: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--from",
+            help="The tool that wrote the poses: nerfstudio, colmap, polycam, record3d; give it "
+            "again for the masks: png, panoptic, sam2, grounded-sam2, coco (default: guessed).",
+        ),
+    ] = None,
     up: Annotated[
         str,
         typer.Option(
             help="Axis of the poses that points up: z or y. `cameras` finds it from upright "
-            "cameras; `auto` is z, or `cameras` for COLMAP's models."
+            "cameras; `auto` is z, y for Polycam, `cameras` for COLMAP and Record3D."
         ),
     ] = "auto",
     tracks: Annotated[
@@ -204,15 +210,14 @@ def prep_posed(
     test_share: Annotated[float, typer.Option(help="Share of rooms in the test split.")] = 0.1,
     seed: SeedOption = 0,
     workers: WorkersOption = None,
-    scheduler: SchedulerOption = None,
     only: Annotated[str | None, typer.Option(help="A room, or a prefix of rooms' names.")] = None,
-    strict: StrictOption = False,
 ) -> None:
     """Turn posed pictures with instance masks into view shards (docs/posed_data.md).
 
     Exit status: 0, or 3 if rooms failed (the others are prepared; report.csv says why).
     """
     from data_prep.engine.build import Job
+    from data_prep.posed.formats import read_formats
     from data_prep.posed.labels import read_label_set
     from data_prep.posed.source import PosedSource
     from data_prep.posed.views import PosedSettings
@@ -221,10 +226,54 @@ def prep_posed(
         up, floor_m, camera_height_m, metres_per_unit, max_side, tracks, max_views
     )
     classes = read_label_set(label_set)
-    source = PosedSource(rooms, classes, settings, test_share, seed, only)
+    formats = read_formats(tools or ())
+    source = PosedSource(rooms, classes, settings, test_share, seed, only, formats)
+    for sentence in source.found():
+        typer.echo(f"Found {sentence}", err=True)
     for sentence in source.assumptions():
         typer.echo(f"Note: {sentence}", err=True)
-    run_job(Job(source, out, workers, scheduler, "auto", strict))
+    run_job(Job(source, out, workers, "auto"))
+
+
+def prep_dataset(
+    name: Annotated[str, typer.Argument(help="blenderproc, hypersim, structured3d or scannetpp.")],
+    folder: Annotated[Path, typer.Argument(help="Folder of its scenes (docs/public_data.md).")],
+    out: OutOption,
+    recipe: Annotated[
+        str | None,
+        typer.Option(
+            help="For blenderproc: a recipe of prep-front, its room types and classes "
+            "(default: bedroom)."
+        ),
+    ] = None,
+    splits: Annotated[
+        Path | None,
+        typer.Option(
+            help="CSV with rows `room or scene,split` (default: the data set's own for "
+            "structured3d, else a random 9:1 split of scenes)."
+        ),
+    ] = None,
+    max_side: Annotated[int, typer.Option(help="Longest side of stored masks in pixels.")] = 480,
+    max_views: Annotated[
+        int, typer.Option(help="Largest number of views per room; others are thinned out.")
+    ] = 100,
+    seed: SeedOption = 0,
+    workers: WorkersOption = None,
+    only: Annotated[
+        str | None, typer.Option(help="One scene or room only: SCENE, SCENE/ROOM or a room id.")
+    ] = None,
+    retry_failed: RetryOption = False,
+) -> None:
+    """Turn a public data set into view shards (docs/public_data.md).
+
+    Exit status: 0, or 3 if rooms failed (the others are prepared; report.csv says why).
+    """
+    from data_prep.engine.build import Job
+    from data_prep.public.source import PublicSource, open_reader
+
+    reader = open_reader(name, folder, recipe)
+    source = PublicSource(reader, splits, max_side, max_views, seed, only)
+    run_job(Job(source, out, workers, "auto", retry_failed))
 
 
 def inspect(
@@ -297,16 +346,12 @@ def run_job(job: "Job") -> None:
 
     from data_prep.engine.build import build_shards
     from data_prep.engine.report_tables import report_tables
-    from data_prep.engine.shard_job import RoomFailedError
 
     try:
         summary = build_shards(job)
     except KeyboardInterrupt:
         typer.echo("Stopped; finished shards are kept. Run the same command to continue.", err=True)
         raise typer.Exit(130) from None
-    except RoomFailedError as error:
-        typer.echo(f"Error: {error}", err=True)
-        raise typer.Exit(3) from None
     console = Console()
     for table in report_tables(summary.report):
         console.print(table)

@@ -16,6 +16,11 @@ _ASPECT_SLACK = 0.02
 """Largest relative difference between the aspect ratios of masks and colour frames; 1296 x 968
 and 640 x 480 differ by 0.4% and show the same picture."""
 
+Y_UP = np.array([[0.0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+"""Maps (x, y, z) with z up to (y, z, x) with y up; stays right-handed."""
+GL_TO_CV = np.diag([1.0, -1, -1, 1])
+"""Maps OpenGL's camera axes (y up, z backward) to OpenCV's, and back."""
+
 
 @dataclass(frozen=True)
 class FrameChoice:
@@ -122,6 +127,16 @@ def room_cameras(camera_to_world: np.ndarray, room_from_scan: np.ndarray) -> np.
     inverse[:, :3, 3:] = -turn @ poses[:, :3, 3:]
     inverse[:, 3, 3] = 1
     return inverse
+
+
+def shrunk(size: tuple[int, int], max_side: int | None) -> tuple[int, int]:
+    """Shrink an image's (height, width) until no side is longer than `max_side`.
+
+    >>> shrunk((768, 1024), 512)
+    (384, 512)
+    """
+    scale = 1.0 if max_side is None else min(1, max_side / max(size))
+    return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
 
 
 def sampled_lines(source: int, target: int) -> np.ndarray:

@@ -43,7 +43,6 @@ from sceneprior.paper.losses.shape import soft_iou
 from sceneprior.paper.sampling import latent_of
 from sceneprior.paper.trained import TrainedPrior
 from sceneprior.paper.view_loss import proxy_boxes
-from sceneprior.render.offscreen import Renderer, open_renderer
 from sceneprior.render.pictures import contact_sheet, paint_ids, png_bytes
 from sceneprior.render.silhouettes import render_silhouettes
 from sceneprior.render.topdown import corner_view, perspective
@@ -68,15 +67,14 @@ def main() -> None:
     out = parser.parse_args().out
     out.mkdir(parents=True, exist_ok=True)
     prior = sceneprior.load("demo-bedroom").with_latents
-    renderer = open_renderer("software")  # the same pixels on every machine
     with training_room() as shard:
         room = shard.read_room(ROOM, images=True)
         draw_training_input(shard, out / "input.png")
-    draw_latent_space(prior, renderer, out / "sphere.png")
-    draw_generation(prior, renderer, out / "objects.png")
+    draw_latent_space(prior, out / "sphere.png")
+    draw_generation(prior, out / "objects.png")
     draw_silhouettes(prior, views_of(room, OF_THE_BED), out / "silhouettes.png")
     draw_matching(prior, views_of(room, OBSERVED), out / "matching.png")
-    draw_geodesic(prior, renderer, out / "geodesic.png")
+    draw_geodesic(prior, out / "geodesic.png")
 
 
 @contextmanager
@@ -99,7 +97,7 @@ def draw_training_input(shard: Shard, path: Path) -> None:
     write(contact_sheet(tiles, 4, [f"camera {k + 1}" for k in range(len(tiles))], 4), path)
 
 
-def draw_latent_space(prior: TrainedPrior, renderer: Renderer, path: Path) -> None:
+def draw_latent_space(prior: TrainedPrior, path: Path) -> None:
     """Anchors and training rooms on the map, one room's weights, and what it decodes to."""
     space = prior.prior.latent_space
     assert isinstance(space, LatentSphere)
@@ -116,18 +114,18 @@ def draw_latent_space(prior: TrainedPrior, renderer: Renderer, path: Path) -> No
     left.legend(fontsize=7)
     left.set(aspect="equal", xticks=[], yticks=[], title="two directions of the sphere")
     (room,) = decode_latents(prior, latent_of(prior, ROOM)[None], ["room"])
-    right.imshow(perspective(room, renderer))
+    right.imshow(perspective(room))
     right.set_title("what the room's point decodes to")
     right.axis("off")
     save(figure, path)
 
 
-def draw_generation(prior: TrainedPrior, renderer: Renderer, path: Path) -> None:
+def draw_generation(prior: TrainedPrior, path: Path) -> None:
     """The room after one object, after two, and so on."""
     (room,) = decode_latents(prior, latent_of(prior, ROOM)[None], ["room"])
     view, tiles, captions = corner_view([room], TILE), [], []
     for k, item in enumerate(room.objects, start=1):
-        tiles.append(perspective(replace(room, objects=room.objects[:k]), renderer, view=view))
+        tiles.append(perspective(replace(room, objects=room.objects[:k]), view=view))
         captions.append(f"{k}: {item.label.replace('_', ' ')}")
     write(contact_sheet(tiles, 4, captions, gap_px=4), path)
 
@@ -212,12 +210,12 @@ def draw_matching(prior: TrainedPrior, views: SceneViews, path: Path) -> None:
     save(figure, path)
 
 
-def draw_geodesic(prior: TrainedPrior, renderer: Renderer, path: Path) -> None:
+def draw_geodesic(prior: TrainedPrior, path: Path) -> None:
     """Rooms at equal angles from the room to another training room."""
     rooms = interpolate(prior, ROOM, OTHER_ROOM, steps=5)
     view = corner_view(rooms, TILE)
     captions = [f"{room.extra['along']:.2f} of the way" for room in rooms]
-    tiles = [perspective(room, renderer, view=view) for room in rooms]
+    tiles = [perspective(room, view=view) for room in rooms]
     write(contact_sheet(tiles, 5, captions, gap_px=4), path)
 
 

@@ -5,6 +5,7 @@ import torch
 from parts_of_rooms import boxes, rays_of
 
 from sceneprior.core.parts import Parts, filled_cells
+from sceneprior.core.wall_lines import Wall
 from sceneprior.lifted.lifting.dataset import LiftedDataset
 from sceneprior.lifted.lifting.lifted import LiftedBoxes, RayPool, ShapeGrid
 from sceneprior.lifted.looks import LookConfig, LookDecoder
@@ -35,8 +36,13 @@ class Lifted(LiftedDataset):
         self.rays = RayPool(*(np.stack(part) for part in zip(*pools, strict=True)))
         self._hulls = np.stack([filled_cells(each, CELLS, 1.0) for each in shapes])
 
+        self.its_walls: list[list[Wall]] = [[] for _ in boxes]
+
     def hulls(self) -> np.ndarray:
         return self._hulls
+
+    def walls(self) -> list[list[Wall]]:
+        return self.its_walls
 
 
 def lifted_rooms(count: int = 6, seed: int = 0) -> Lifted:

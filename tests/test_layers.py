@@ -40,7 +40,7 @@ MAY_TOO = {
 }
 
 OWNERS = {
-    "h5py": ["sceneprior/core/shard"],
+    "h5py": ["sceneprior/core/shard", "data_prep/public/hdf5.py"],
     "pyrender": ["sceneprior/render/offscreen/"],
     "OpenGL": ["sceneprior/render/offscreen/"],
     "numba": [
@@ -76,7 +76,6 @@ OWNERS = {
     "viser": ["sceneprior/apps/viewer/"],
     "mujoco": ["sceneprior/evaluation/metrics/stability.py"],
     "coacd": ["sceneprior/core/colliders.py"],
-    "distributed": ["data_prep/engine/cluster.py"],
 }  # fmt: skip
 
 

@@ -24,6 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from capture_files import timestamp, write_grounded_sam2_images, write_polycam
 from model_folder import blocks, write_models
 from pages import PAGES, ROOT, Block, blocks_of, commands_of, name_of
 from PIL import Image
@@ -39,10 +40,11 @@ RUN_HERE = [
     "README.md", "docs/index.md", "docs/tutorial.md", "docs/concepts.md", "docs/uses.md",
     "docs/reconstruction.md", "docs/evaluation.md", "docs/cluster.md", "docs/comparing.md",
     "docs/baselines_2d.md", "docs/baselines_3d.md", "docs/baselines_single_view.md",
-    "docs/paper_map.md", "docs/requests.md", "docs/simulators.md",
+    "docs/paper_map.md", "docs/requests.md", "docs/simulators.md", "docs/captures.md",
 ]  # fmt: skip
 WHOLE_PAGES = {
     "docs/posed_data.md": "tests/data_prep/posed/test_docs.py",
+    "docs/public_data.md": "tests/data_prep/public/test_data_sets.py",
     "docs/own_room_types.md": "tests/data_prep/front/test_own_room_types.py",
 }
 """Guides that tests of their own run as printed, on data of their own."""
@@ -55,7 +57,6 @@ ELSEWHERE = {
     "compare/new_rooms_small.yaml": "tests/apps/experiments/test_compare.py compares toys",
     "compare/single_view.yaml": "tests/apps/experiments/test_compare_views.py compares toys",
     "--devices 2": "tests/training/test_processes.py trains in two processes",
-    "--devices 4 --resume": "tests/training/test_slurm.py is stopped and queued again as there",
     "python benchmarks/": "a measurement, of runs that take hours",
 }
 """Part of a command -> the reason why such commands are not run here."""
@@ -106,6 +107,15 @@ def write_captures(path: Path, toys: Toys) -> None:
     Path("classes.txt").write_text("bed\nchair\n")
 
 
+def write_phone(path: Path, toys: Toys) -> None:
+    """Polycam's poses, and the masks of a segmenter of single images."""
+    for k in range(12):
+        room = PosedRoom(path / f"room{k}", furniture(0.1 * k - 0.5)).write()
+        write_grounded_sam2_images(room, timestamp)
+        write_polycam(room)
+    Path("classes.txt").write_text("bed\nchair\n")
+
+
 def write_homes(path: Path, toys: Toys) -> None:
     """`3D-FRONT` and `3D-FUTURE-model`."""
     make_homes(Path("homes"), 10, "bedroom", seed=0)
@@ -144,7 +154,7 @@ TOYS: dict[str, Callable[[Path, Toys], None]] = {
     "out/demo/scenes": write_scenes, "DIR": write_scenes,
     "out/demo/homes/3D-FUTURE-model": write_models_of_homes,
     "mine.png": write_masks, "coco.json": write_masks,
-    "captures": write_captures, "3D-FRONT": write_homes,
+    "captures": write_captures, "phone": write_phone, "3D-FRONT": write_homes,
     "about.md": write_about, "out/demo/scores.json": write_scores,
 }  # fmt: skip
 """A name that a command of a page reads -> what writes it."""

@@ -66,7 +66,7 @@ def test_homes_become_shards_and_the_page_template_is_there(installed, tmp_path)
 def test_a_prior_of_the_package_makes_rooms(installed, tmp_path):
     done = run(
         installed, "-m", "sceneprior", "synthesize", "--run", "procthor-bedroom", "-n", "2",
-        "--out", "rooms", "--renderer", "software", cwd=tmp_path,
+        "--out", "rooms", cwd=tmp_path,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert done.stdout == "Wrote 2 rooms to rooms (from: sampler)\n"

@@ -1,23 +1,20 @@
 """Builds a folder of shards from a source, in parallel and resumable.
 
 Every `prep-*` command runs this engine. It prepares the source's rooms shard by shard
-(shard_job.py) in processes on this machine (workers.py) or on a cluster (cluster.py), and writes
-a report at the end.
+(shard_job.py) in worker processes (workers.py), and writes a report at the end.
 """
 
 import os
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from data_prep.engine.cluster import cluster
 from data_prep.engine.output import claimed, writing
 from data_prep.engine.plan import PLAN_NAME, Plan, ShardPlan, job_settings, read_plan
 from data_prep.engine.report import REPORT_FILES, Summary, finish
 from data_prep.engine.selection import is_asked_for
-from data_prep.engine.shard_job import RoomFailedError, ShardReport, make_shard, read_finished
-from data_prep.engine.source import Line, Source
+from data_prep.engine.shard_job import ShardReport, make_shard, read_finished
+from data_prep.engine.source import Source
 from data_prep.engine.workers import Run, pool
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import write_json
@@ -32,39 +29,27 @@ class Job:
     out: Path
     workers: int | None = 1
     """Number of processes on this machine; 1 works in this process, None takes all cores."""
-    scheduler: str | None = None
-    """Address of a Dask scheduler whose workers are used instead of local processes."""
     renderer: str = "auto"
-    strict: bool = False
     retry_failed: bool = False
 
 
 def build_shards(job: Job) -> Summary:
-    """Prepare a data set. A second run with the same settings makes only the missing shards.
-
-    With `strict`, a room that fails raises a `RoomFailedError`.
-    """
+    """Prepare a data set. A second run with the same settings makes only the missing shards."""
     source, out = job.source, Path(job.out)
-    if job.scheduler:
-        # The workers' working directories differ from this process's.
-        source, out = _with_absolute_paths(source), out.absolute()
     settings = job_settings(source, source.only)  # rejects wrong input folders before `out` exists
     cores = len(os.sched_getaffinity(0))
-    engine = cluster(job.scheduler) if job.scheduler else pool(job.workers or cores)
-    with claimed(out), engine as run:
+    with claimed(out), pool(job.workers or cores) as run:
         plan = read_plan(out, source, settings, job.renderer)
         if plan is None:
             plan = _make_plan(source, settings, job, run)
             with writing(out):
                 write_json(out / PLAN_NAME, asdict(plan))
-        _refuse_failures(job, plan.left_out)
-        return _carry_out(replace(job, source=source, out=out), plan, run)
+        return _carry_out(replace(job, out=out), plan, run)
 
 
 def _make_plan(source: Source, settings: dict[str, Any], job: Job, run: Run) -> Plan:
     kind = next(run(_renderer_kind, [(job.renderer,)], None)) if source.draws else None
     survey = source.survey(run)
-    _refuse_failures(job, survey.left_out)
     return Plan({**settings, "renderer": kind}, survey.rooms, survey.left_out)
 
 
@@ -80,7 +65,6 @@ def _carry_out(job: Job, plan: Plan, run: Run) -> Summary:
         report = read_finished(out / shard.name)
         if report is not None and not (job.retry_failed and report.has("failed")):
             reports[shard.name] = report
-            _refuse_failures(job, report.lines)
     kept = len(reports)
     missing = [shard for shard in _asked_for(source, plan, shards) if shard.name not in reports]
     if missing:
@@ -89,7 +73,7 @@ def _carry_out(job: Job, plan: Plan, run: Run) -> Summary:
             for name in REPORT_FILES:
                 (out / name).unlink(missing_ok=True)
     kind = plan.settings["renderer"]
-    arguments = [(source, out, kind, shard, job.strict) for shard in missing]
+    arguments = [(source, out, kind, shard) for shard in missing]
     made = run(make_shard, arguments, "preparing") if missing else iter(())
     for shard, report in zip(missing, made, strict=True):
         reports[shard.name] = report
@@ -126,15 +110,3 @@ def _asked_for(source: Source, plan: Plan, shards: list[ShardPlan]) -> list[Shar
             f"--only {source.only} selects no room of the plan{whys[0] if whys else ''}."
         )
     return chosen
-
-
-def _refuse_failures(job: Job, lines: Iterable[Line]) -> None:
-    for line in lines:
-        if job.strict and line.status == "failed":
-            raise RoomFailedError.of(line)
-
-
-def _with_absolute_paths(source: Any) -> Any:
-    values = {item.name: getattr(source, item.name) for item in fields(source)}
-    paths = {name: value.absolute() for name, value in values.items() if isinstance(value, Path)}
-    return replace(source, **paths)

@@ -5,7 +5,7 @@ import hashlib
 import io
 import re
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from data_prep.engine.source import Line, Survey
@@ -67,6 +67,30 @@ def seeded_split(
 
 def _size(share: float, rooms: int, left: int) -> int:
     return min(round(share * rooms) or 1, left - 1) if share > 0 else 0
+
+
+def of_one_size(
+    sizes: Mapping[str, tuple[int, int]], houses: Mapping[str, str] | None = None
+) -> tuple[list[str], list[Line]]:
+    """Keep the rooms whose images have the most frequent (height, width).
+
+    Batches hold images of several rooms, so all rooms of a folder must have one size. Returns the
+    ids of the rooms that are kept, and lines of the report for the others; `houses` has the house
+    of each room, which by default is the room itself.
+    """
+    usual = Counter(sizes.values()).most_common(1)[0][0] if sizes else (0, 0)
+    kept, left_out = [], []
+    for room_id, size in sizes.items():
+        if size == usual:
+            kept.append(room_id)
+            continue
+        why = (
+            f"its views are {size[1]} x {size[0]} pixels, those of most rooms {usual[1]} x "
+            f"{usual[0]}, and all shards of a folder need one size; prepare it separately"
+        )
+        house = room_id if houses is None else houses[room_id]
+        left_out.append(Line(room_id, house, "filtered", "image_size", why))
+    return kept, left_out
 
 
 def select(survey: Survey, only: str | None, where: str, splits: str = "") -> Survey:

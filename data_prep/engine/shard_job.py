@@ -7,10 +7,9 @@ from pathlib import Path
 from pydantic import TypeAdapter, ValidationError
 
 from data_prep.engine.output import writing
-from data_prep.engine.plan import PLAN_NAME, ShardPlan
+from data_prep.engine.plan import ShardPlan
 from data_prep.engine.report import line_of
 from data_prep.engine.source import Line, PreparedRoom, RoomTask, Source, sentence_of
-from sceneprior.core.errors import InputError
 from sceneprior.core.files import write_json, write_whole
 from sceneprior.core.scene import Mesh
 from sceneprior.core.shard_writing import check_views, shard_bytes
@@ -31,31 +30,14 @@ class ShardReport:
         return any(line.status == status for line in self.lines)
 
 
-class RoomFailedError(InputError):
-    """A room failed, and `--strict` stops there."""
-
-    @classmethod
-    def of(cls, line: Line) -> "RoomFailedError":
-        """Error for the line of a failed room."""
-        return cls(
-            f"Room {line.room_id} failed: {line.reason.rstrip('.')}. --strict stops here; finished "
-            "shards are kept, and the same command without --strict continues."
-        )
-
-
 def make_shard(
-    source: Source, out: Path, renderer_kind: str | None, shard: ShardPlan, strict: bool
+    source: Source, out: Path, renderer_kind: str | None, shard: ShardPlan
 ) -> ShardReport:
     """Prepare the rooms of one shard and write it.
 
     Models are written first, then the report, then the shard, so that a shard with a report is
-    complete (`read_finished`). With `strict`, neither is written if a room fails.
+    complete (`read_finished`).
     """
-    if not (out / PLAN_NAME).is_file():
-        raise InputError(
-            f"A worker finds no {PLAN_NAME} in {out}: workers must reach the folders of the data "
-            "and of the shards under the same paths as this machine."
-        )
     path = out / shard.name
     first, last = shard.rooms[0].room_id, shard.rooms[-1].room_id
     with writing(out, f"rooms {first} to {last}"):
@@ -64,7 +46,7 @@ def make_shard(
         path.unlink(missing_ok=True)
         renderer = None if renderer_kind is None else open_renderer(renderer_kind)
         report = ShardReport(renderer.name if renderer else None, [])
-        rooms = _prepared(source, out, renderer, shard, strict, report.lines)
+        rooms = _prepared(source, out, renderer, shard, report.lines)
         data = shard_bytes(shard.name, source.label_set, rooms)
         write_json(_report_path(path), asdict(report))
         if report.has("prepared"):
@@ -90,15 +72,12 @@ def _prepared(
     out: Path,
     renderer: Renderer | None,
     shard: ShardPlan,
-    strict: bool,
     lines: list[Line],
 ) -> Iterator[tuple[RoomViews, RoomGroundTruth | None]]:
     """Prepare the shard's rooms one by one, write their models, append outcomes to `lines`."""
     for task in shard.rooms:
         result = _prepare(source, task, renderer)
         line = line_of(result, task, source.label_set)
-        if strict and line.status == "failed":
-            raise RoomFailedError.of(line)
         lines.append(line)
         if isinstance(result, Line):
             continue

@@ -38,8 +38,18 @@ def pool(workers: int) -> Iterator[Run]:
         finally:
             signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
+    def in_order(
+        function: Callable[..., Any], arguments: list[Any], title: str | None
+    ) -> Iterator[Any]:
+        with progress(title, len(arguments)) as advance:
+            futures = [submit(function, *item) for item in arguments]
+            for future in futures:
+                future.add_done_callback(lambda _: advance())
+            for future in futures:
+                yield future.result()
+
     try:
-        yield lambda *work: in_order(submit, *work)
+        yield in_order
     except BrokenProcessPool:
         raise InputError(
             "A worker process died (was it killed for lack of memory?). Finished shards are kept: "
@@ -52,21 +62,6 @@ def pool(workers: int) -> Iterator[Run]:
         raise
     finally:
         executor.shutdown(wait=True, cancel_futures=True)
-
-
-def in_order(
-    submit: Callable[..., Any],
-    function: Callable[..., Any],
-    arguments: list[Any],
-    title: str | None,
-) -> Iterator[Any]:
-    """Submit all calls, which return futures, and yield their results in order."""
-    with progress(title, len(arguments)) as advance:
-        futures = [submit(function, *item) for item in arguments]
-        for future in futures:
-            future.add_done_callback(lambda _: advance())
-        for future in futures:
-            yield future.result()
 
 
 def _in_process(

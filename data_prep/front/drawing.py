@@ -2,17 +2,26 @@
 
 import hashlib
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from data_prep.front.furnished import Room
 from data_prep.front.recipe import Recipe, ViewRules
+from data_prep.front.rgb import soup
 from data_prep.front.viewpoints import Viewpoints, intrinsics, sees_enough
-from sceneprior.core.classes import VOID, label_set
+from sceneprior.core.classes import STUFF, VOID, label_set
 from sceneprior.core.instances.observations import observe, pixel_counts
 from sceneprior.core.scene import Mesh
-from sceneprior.core.shards import RoomGroundTruth, RoomViews
-from sceneprior.render.offscreen import Renderer
+from sceneprior.core.shards import (
+    RoomGroundTruth,
+    RoomViews,
+    stuff_size,
+    stuff_step,
+    thinned,
+    thinned_intrinsics,
+)
+from sceneprior.render.offscreen import Pinhole, Renderer
 
 
 def prepare_room(
@@ -32,6 +41,7 @@ def prepare_room(
     if not len(seen.tracked):
         return None
     views = seen.room_views(room.room_id, world_to_camera, intrinsics(recipe.views))
+    views = replace(views, stuff=_draw_stuff(room, views, renderer))
     order = np.concatenate([seen.tracked, seen.unseen])
     pieces = [room.furniture[k] for k in order]
     lower, upper = boxes_m[order, 0], boxes_m[order, 1]
@@ -73,3 +83,17 @@ def _draw_views(
         open_views = still_open
     _, world_to_camera, chosen = zip(*(best[view] for view in range(count)), strict=True)
     return np.stack(world_to_camera), np.stack(chosen)
+
+
+def _draw_stuff(room: Room, views: RoomViews, renderer: Renderer) -> np.ndarray:
+    """Draw floor, walls, doors, windows and ceiling behind all furniture; see `RoomViews.stuff`."""
+    meshes = [soup(room.shell.get(name, np.zeros((0, 3, 3)))) for name in STUFF[1:]]
+    step = stuff_step(views.image_size)
+    cameras = [
+        Pinhole(turn.astype(np.float64), thinned_intrinsics(K, step))
+        for turn, K in zip(views.world_to_camera, views.intrinsics, strict=True)
+    ]
+    stuff = renderer.instance_ids_of_views(meshes, cameras, stuff_size(views.image_size))
+    assert views.instance_ids is not None
+    free = views.instance_ids[(..., *thinned(step))] == 0
+    return np.where(free, stuff, 0).astype(np.uint8)

@@ -1,6 +1,7 @@
 """Room and Furniture: a furnished room in its own frame, the result of reading any 3D source."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 import shapely
@@ -53,6 +54,8 @@ class Room:
     """Parts of the room that were left out, with reasons."""
     without_model: tuple[tuple[str, str], ...] = ()
     """Model id and category of each piece that is left out for lack of a model."""
+    shell: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """Triangles, (F, 3, 3), of the room itself by their class in `STUFF`, in the room frame."""
 
     @property
     def floor_outline_m(self) -> np.ndarray:

@@ -70,7 +70,7 @@ def shell_of(room: Room) -> list[Mesh]:
         ]
     )
     floor, ceiling = (np.insert(flat, 1, height, axis=2) for height in (0.0, room.height_m))
-    return [_soup(floor), _soup(walls), _soup(ceiling)]
+    return [soup(floor), soup(walls), soup(ceiling)]
 
 
 def _sides(ring: np.ndarray) -> np.ndarray:
@@ -78,6 +78,7 @@ def _sides(ring: np.ndarray) -> np.ndarray:
     return np.stack([ring[:-1], ring[1:]], axis=1)
 
 
-def _soup(triangles: np.ndarray) -> Mesh:
+def soup(triangles: np.ndarray) -> Mesh:
+    """Mesh of triangles, (F, 3, 3), that share no corners."""
     corners = triangles.reshape(-1, 3)
     return Mesh(corners, np.arange(len(corners), dtype=np.int32).reshape(-1, 3))

@@ -28,6 +28,14 @@ from sceneprior.core.scene import Mesh
 
 _NO_MESH = Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
 _FLAT = 1e-9
+STUFF_OF_MESH = {
+    "Floor": "floor", "WallInner": "wall", "Baseboard": "wall", "Customized_wainscot": "wall",
+    "CustomizedFeatureWall": "wall", "CustomizedBackgroundModel": "wall",
+    "ExtrusionCustomizedBackgroundWall": "wall", "Door": "door", "Window": "window",
+    "BayWindow": "window", "Ceiling": "ceiling", "CustomizedCeiling": "ceiling",
+    "SmartCustomizedCeiling": "ceiling", "ExtrusionCustomizedCeilingModel": "ceiling",
+}  # fmt: skip
+"""Class in `STUFF` of the types of meshes that one sees from inside a room."""
 
 
 @dataclass
@@ -123,6 +131,11 @@ class _RoomReader:
         surfaces = self._surfaces(children, notes)
         floor, floor_y = floor_of(surfaces.get("Floor", []))
         room_from_house = room_frame(floor, floor_y)
+        shell: dict[str, list[np.ndarray]] = {}
+        for kind, parts in surfaces.items():
+            shell.setdefault(STUFF_OF_MESH[kind], []).extend(
+                part @ room_from_house[:3, :3].T + room_from_house[:3, 3] for part in parts
+            )
         return Room(
             room_id,
             room_type,
@@ -130,6 +143,7 @@ class _RoomReader:
             height_of(surfaces, floor_y),
             tuple(self._furniture(placed, room_from_house, notes)),
             tuple(notes),
+            shell={name: np.concatenate(parts) for name, parts in shell.items()},
             without_model=tuple(
                 (model_id, self._category(model_id, entry))
                 for _, entry in placed
@@ -144,7 +158,7 @@ class _RoomReader:
         for child in children:
             mesh = self.house.meshes.get(key_of(child.get("ref")))
             kind = mesh.get("type") if mesh else None
-            if mesh is None or kind not in ("Floor", "WallInner", "Ceiling"):
+            if mesh is None or kind not in STUFF_OF_MESH:
                 continue
             try:
                 surface, unusable = surface_of(mesh, child)

@@ -13,6 +13,9 @@ from sceneprior.furniture.catalog import Model
 
 WALL_M = 0.12
 """Thickness of a wall."""
+_DOOR_HEIGHT_M = 2.0
+_BEFORE_WALL_M = 0.005
+"""Distance of a door from its wall, which has no hole."""
 
 _IDENTITY = {"pos": [0, 0, 0], "rot": [0, 0, 0, 1], "scale": [1, 1, 1]}
 
@@ -96,9 +99,9 @@ def house_json(uid: str, rooms: list[PlacedRoom]) -> dict[str, Any]:
 
 
 def shell(plan: Plan) -> list[tuple[str, np.ndarray]]:
-    """Floor, ceiling and walls in the room's frame, each as (type, (triangles, 3, 3)).
+    """Floor, ceiling, walls and door in the room's frame, each as (type, (triangles, 3, 3)).
 
-    Floor, ceiling and inner walls face the room; outer walls face away from it.
+    Floor, ceiling, inner walls and the door face the room; outer walls face away from it.
     """
     tiles = np.concatenate([_tile(rect) for rect in _rectangles(plan)])
     ceiling = tiles[:, ::-1] + np.array([0.0, plan.height, 0.0])
@@ -108,7 +111,24 @@ def shell(plan: Plan) -> list[tuple[str, np.ndarray]]:
     inner = [_wall(*ends, plan.height) for ends in zip(corners, after[0], strict=True)]
     outer = [_wall(*ends, plan.height) for ends in zip(after[1], outside, strict=True)]
     walls = [("WallInner", part) for part in inner] + [("WallOuter", part) for part in outer]
-    return [("Floor", tiles), ("Ceiling", ceiling), *walls]
+    door = _wall(*_door(plan), _DOOR_HEIGHT_M)
+    return [("Floor", tiles), ("Ceiling", ceiling), *walls, ("Door", door)]
+
+
+def _door(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
+    """Ends of the door: the side of the clear floor before it that is nearest to a wall."""
+    x0, z0, x1, z1 = plan.kept_clear[0]
+    half_m = np.array([x1 - x0, z1 - z0]) / 2
+    middle, found = np.array([(x0 + x1) / 2, (z0 + z1) / 2]), []
+    for wall in plan.walls:
+        along = np.array(wall.along, dtype=float)
+        inward = np.array([-along[1], along[0]])
+        from_start = middle - (wall.x, wall.z)
+        reaches = 0 < from_start @ along < wall.length
+        off_m = abs(from_start @ inward - half_m @ abs(inward)) if reaches else np.inf
+        base = middle - (half_m @ abs(inward) - _BEFORE_WALL_M) * inward
+        found.append((off_m, base - half_m * along, base + half_m * along))
+    return min(found, key=lambda each: each[0])[1:]
 
 
 def _rectangles(plan: Plan) -> list[Rect]:

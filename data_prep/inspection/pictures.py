@@ -6,12 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import shapely
 from PIL import Image, ImageDraw, ImageFont
 
 from data_prep.engine.source import SPLITS
 from data_prep.inspection.projection import Segment, to_camera, wire_pixels
 from sceneprior.core.classes import class_colors, label_set
 from sceneprior.core.errors import InputError
+from sceneprior.core.found_floor import find_floor
 from sceneprior.core.geometry.corners import BOX_EDGES, box_corners
 from sceneprior.core.shards import RoomGroundTruth, RoomViews, Shard, list_shards
 from sceneprior.render.pictures import contact_sheet, paint_ids
@@ -19,6 +21,7 @@ from sceneprior.render.pictures import contact_sheet, paint_ids
 BACKGROUND = (246, 246, 246)
 GRID = (206, 206, 206)
 OUTLINE = (120, 120, 120)
+FLOOR, WALL, DOOR = (226, 220, 204), (90, 70, 50), (230, 140, 20)
 AXES = {"x": (205, 30, 30), "y": (20, 140, 40), "z": (30, 60, 210)}
 _AXIS_M = 0.5
 _GRID_M = 1.0
@@ -29,7 +32,8 @@ LEGEND = (
     "Filled: instance masks in class colours. Coloured frames: their 2D boxes, with the object's "
     "number, the same in all views. Black wires: 3D "
     "boxes of the ground truth, with a bar ahead of the piece's front. Grid: the floor y = 0, "
-    "metres, with the room's axes x, y, z."
+    "metres, with the room's axes x, y, z. From above, found in masks of floor, walls and doors: "
+    "the floor that some view shows (filled), walls (brown) and doors (orange)."
 )
 _TILE = (480, 360)
 _GAP_PX, _LINE_PX = 8, 15
@@ -133,8 +137,9 @@ def draw_view(
 
 
 def draw_plan(shard: Shard, room_id: str, width_px: int = 480, height_px: int = 360) -> Image.Image:
-    """Draw the room from above (+x right, +z down): floor, boxes, fronts, cameras."""
-    room, truth = shard.read_room(room_id), _truth(shard, room_id)
+    """Draw the room from above (+x right, +z down): floor, walls, boxes, fronts, cameras."""
+    has_stuff = shard.has_stuff(room_id)
+    room, truth = shard.read_room(room_id, images=has_stuff), _truth(shard, room_id)
     names = label_set(shard.label_set)
     colors = class_colors(len(names))
     low, high = _floor_bounds(room, truth)
@@ -149,6 +154,12 @@ def draw_plan(shard: Shard, room_id: str, width_px: int = 480, height_px: int = 
 
     picture = Image.new("RGB", (width_px, height_px), BACKGROUND)
     draw = ImageDraw.Draw(picture)
+    found = find_floor(room) if has_stuff else None
+    if found is not None:
+        for part in shapely.get_parts(found.seen):
+            draw.polygon([at(*point) for point in part.exterior.coords], fill=FLOOR)
+            for hole in part.interiors:
+                draw.polygon([at(*point) for point in hole.coords], fill=BACKGROUND)
     for (x1, _, z1), (x2, _, z2) in _grid(low, high):
         draw.line((*at(x1, z1), *at(x2, z2)), fill=GRID)
     if truth is not None:
@@ -166,6 +177,10 @@ def draw_plan(shard: Shard, room_id: str, width_px: int = 480, height_px: int = 
             _tag(
                 draw, (corners[0] + 2, corners[1] + 2), label, _dark(colors[truth.object_class[k]])
             )
+    if found is not None:
+        for lines, color in ((found.walls, WALL), (found.doors, DOOR)):
+            for line in lines:
+                draw.line((*at(*line.start_m), *at(*line.end_m)), fill=color, width=4)
     for matrix in room.world_to_camera.astype(np.float64):
         eye = -matrix[:3, :3].T @ matrix[:3, 3]
         u, v = at(eye[0], eye[2])

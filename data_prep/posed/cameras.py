@@ -2,12 +2,11 @@
 
 import numpy as np
 
-from data_prep.frames import is_pose, room_cameras
+from data_prep.frames import GL_TO_CV, is_pose, room_cameras
 from data_prep.posed.recording import Recording
 from sceneprior.core.errors import InputError
 
 UP = ("auto", "z", "y", "cameras")
-_GL_TO_CV = np.diag([1.0, -1, -1, 1])
 _Y_UP = {
     "y": np.eye(4),
     # (x, y, z) with z up -> (x, z, -y); stays right-handed.
@@ -24,7 +23,7 @@ def upright_cameras(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rotate cameras to a world whose y points up, in metres.
 
-    `up` is one of `UP`; `auto` is z, or `cameras` for a world without an axis that points up.
+    `up` is one of `UP`; `auto` is the recording's own.
 
     Returns:
         Camera-to-world matrices, (views, 4, 4) with OpenCV axes, and the (4, 4) transform from the
@@ -33,7 +32,7 @@ def upright_cameras(
     poses = np.stack([recording.frames[i].camera_to_world for i in frames])
     poses[:, :3, 3] *= recording.metres_per_unit or metres_per_unit
     if up == "auto":
-        up = "z" if recording.leveled else "cameras"
+        up = recording.up
     turn = _turn_of_cameras(recording, poses) if up == "cameras" else _Y_UP[up]
     upright = turn @ poses
     spread = np.ptp(upright[:, :3, 3], axis=0).max()
@@ -42,7 +41,7 @@ def upright_cameras(
             f"{recording.path}: its cameras are spread over {spread:.0f} m; is "
             "metres_per_unit wrong?"
         )
-    return upright @ _GL_TO_CV, turn
+    return upright @ GL_TO_CV, turn
 
 
 def _turn_of_cameras(recording: Recording, poses: np.ndarray) -> np.ndarray:

@@ -3,10 +3,10 @@
 import json
 from pathlib import Path
 
-from data_prep.posed.panoptic import FILE_NAME as PANOPTIC
 from sceneprior.core.classes import LABEL_SETS, label_set_name
 from sceneprior.core.errors import InputError
 
+PANOPTIC = "panoptic.json"
 TABLES = ("classes.json", "classes.csv", PANOPTIC)
 
 

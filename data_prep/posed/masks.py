@@ -1,38 +1,25 @@
 """Reads a room's masks of instance ids, undistorts and downsamples them."""
 
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 
 from data_prep.frames import mask_intrinsics, sampled_lines
-from data_prep.posed.labels import find_table
 from data_prep.posed.lens import Lens, Straightened, straighten
-from data_prep.posed.panoptic import FILE_NAME as PANOPTIC
-from data_prep.posed.panoptic import read_panoptic
+from data_prep.posed.mask_format import MaskFormat
 from data_prep.posed.recording import PosedFrame, frame_intrinsics
 from sceneprior.core.errors import InputError
 from sceneprior.core.instances.checked import shown
-from sceneprior.core.instances.pngs import mask_size, read_mask
-from sceneprior.core.instances.tables import IdTable, read_class_table
-
-
-def png_size(folder: Path, frame: PosedFrame) -> tuple[int, int]:
-    """Size, (height, width), of a frame's PNG of ids."""
-    return mask_size(frame.instances, rgb=(folder / PANOPTIC).is_file())
+from sceneprior.core.instances.pngs import read_mask
+from sceneprior.core.instances.tables import IdTable
 
 
 class MaskPixels:
     """Reads the values of masks, all of one size, undistorted and downsampled.
 
-    `read` reads a PNG; `size` is that of every PNG, and `stored` that of the downsampled images:
-    (height, width).
+    `size` is that of all masks, and `stored` that of the downsampled images: (height, width).
     """
 
-    def __init__(
-        self, read: Callable[[Path], np.ndarray], size: tuple[int, int], stored: tuple[int, int]
-    ):
-        self._read, self._size, self._stored = read, size, stored
+    def __init__(self, masks: MaskFormat, size: tuple[int, int], stored: tuple[int, int]):
+        self._masks, self._size, self._stored = masks, size, stored
         self._views: dict[tuple[Lens, bytes], Straightened] = {}
 
     @property
@@ -64,12 +51,12 @@ class MaskPixels:
 
     def _values(self, frame: PosedFrame) -> np.ndarray:
         """Read the ids of one frame, int32; -1 where they are unknown."""
-        ids = self._read(frame.instances).astype(np.int32)
+        ids = self._masks.read(frame).astype(np.int32)
         size = self._size
         if ids.shape != size:
             raise InputError(
-                f"{frame.instances} is {ids.shape[1]} x {ids.shape[0]} pixels, but the first "
-                f"frame's {size[1]} x {size[0]}; a room has one size"
+                f"the mask of frame {shown(frame.name)} is {ids.shape[1]} x {ids.shape[0]} pixels, "
+                f"but the first frame's {size[1]} x {size[0]}; a room has one size"
             )
         if frame.known is not None:
             known = read_mask(frame.known)
@@ -85,28 +72,22 @@ class MaskPixels:
 class RoomMasks:
     """Masks of one room with tracked ids, and notes about them; see `MaskPixels`."""
 
-    def __init__(
-        self, folder: Path, label_set_name: str, size: tuple[int, int], stored: tuple[int, int]
-    ):
-        table = find_table(folder)
-        if table.name == PANOPTIC:
-            panoptic = read_panoptic(table, label_set_name)
-            of_id, read = panoptic.classes, panoptic.read
-        else:
-            of_id, read = read_class_table(table), read_mask
-        self.table = IdTable(of_id, label_set_name, str(folder))
-        self._pixels = MaskPixels(read, size, stored)
+    def __init__(self, masks: MaskFormat, size: tuple[int, int], stored: tuple[int, int]):
+        self.table = IdTable(masks.classes(), masks.label_set_name, str(masks.folder))
+        self._notes = masks.notes
+        self._pixels = MaskPixels(masks, size, stored)
 
     @property
     def notes(self) -> list[str]:
         """Notes on everything left out or changed so far."""
-        notes = list(self.table.notes)
+        notes = [*self._notes, *self.table.notes]
         if self.table.unlisted:
             listed = ", ".join(map(str, sorted(self.table.unlisted)[:20]))
             notes.append(f"masks show ids that the table of classes does not have ({listed}): void")
         return notes + self._pixels.notes
 
-    def read(self, frame: PosedFrame) -> tuple[np.ndarray, np.ndarray]:
-        """Read a frame's uint32 ids for `observe`, at the stored size, and their intrinsics."""
+    def read(self, frame: PosedFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Read a frame's uint32 ids for `observe` and its stuff, at the stored size, and their
+        intrinsics."""
         values, intrinsics = self._pixels.read(frame)
-        return self.table.ids(values), intrinsics
+        return self.table.ids(values), self.table.stuff(values), intrinsics

@@ -1,27 +1,29 @@
 """Reads COCO's panoptic format: PNGs whose colours encode segment ids, and one JSON for all PNGs.
 
-Ids must be tracked: an object has the same id in all frames, as in the output of video segmenters.
-The ids of COCO's own single images are not tracked.
+Video segmenters give an object the same id in all frames; the ids of COCO's own single images are
+not tracked.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from sceneprior.core.classes import label_set
+from data_prep.posed.labels import PANOPTIC, find_table
+from data_prep.posed.mask_format import MaskFormat
+from data_prep.posed.recording import INSTANCES, PosedFrame
+from sceneprior.core.classes import STUFF, label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
 from sceneprior.core.instances.checked import checked
-from sceneprior.core.instances.pngs import read_rgb
-from sceneprior.core.instances.tables import LARGEST_ID, tidy
+from sceneprior.core.instances.coco import CROWD
+from sceneprior.core.instances.pngs import mask_size, read_rgb
+from sceneprior.core.instances.tables import LARGEST_ID, stuff_of, tidy
 
-FILE_NAME = "panoptic.json"
-_CROWD = "crowd"
-"""Class of segments that are not a single object."""
-_STUFF = "background"
+_BACKGROUND = "background"
 
 _Id = Annotated[int, Field(ge=0, lt=2**24)]
 
@@ -52,16 +54,51 @@ class _Panoptic(_Strict):
     annotations: list[_Annotation]
 
 
+class PanopticPngs(MaskFormat):
+    """The masks of a room whose table is a `panoptic.json`."""
+
+    name = "panoptic"
+    title = f"COCO panoptic PNGs ({INSTANCES}/, {PANOPTIC})"
+
+    @classmethod
+    def find(cls, folder: Path) -> list[Path]:
+        table = folder / PANOPTIC
+        return [table, *sorted((folder / INSTANCES).rglob("*.png"))] if table.is_file() else []
+
+    @cached_property
+    def _ids(self) -> "PanopticIds":
+        return read_panoptic(find_table(self.folder), self.label_set_name)
+
+    def has(self, frame: PosedFrame) -> bool:
+        return frame.instances.is_file()
+
+    def wanted(self, frame: PosedFrame) -> str:
+        return str(frame.instances)
+
+    def size(self, frame: PosedFrame) -> tuple[int, int]:
+        return mask_size(frame.instances, rgb=True)
+
+    def read(self, frame: PosedFrame) -> np.ndarray:
+        return self._ids.read(frame.instances)
+
+    def classes(self) -> dict[int, str]:
+        return self._ids.tracked_classes(self.folder / PANOPTIC)
+
+    def frame_classes(self, frame: PosedFrame) -> dict[int, str]:
+        return self._ids.of_frame.get(frame.instances.stem, {})
+
+
 @dataclass(frozen=True)
 class PanopticIds:
     """Segments of a room, renumbered to consecutive ids."""
 
     segments: np.ndarray
     """(n,) segment ids, ascending."""
-    classes: dict[int, str]
-    """Class by new id: k + 1 for the k-th segment; "background" for stuff (walls, floors)."""
     of_frame: dict[str, dict[int, str]]
-    """The same for the segments of each frame alone, by the stem of its PNG."""
+    """Class of each new id, k + 1 for the k-th segment, in each frame, by the stem of its PNG;
+    stuff is of a class of `STUFF`, or "background"."""
+    stuff: frozenset[str]
+    """Classes of stuff that the label set does not have, "background" included."""
 
     def read(self, path: Path) -> np.ndarray:
         """Read a PNG as new ids, (height, width) int32.
@@ -75,20 +112,42 @@ class PanopticIds:
         numbers = np.where(there, place + 1, len(self.segments) + 1)
         return np.where(ids == 0, 0, numbers).astype(np.int32)
 
+    def tracked_classes(self, path: Path) -> dict[int, str]:
+        """Class by new id; `path` is the JSON's.
 
-def read_panoptic(path: Path, label_set_name: str, tracked: bool = True) -> PanopticIds:
-    """Read a room's annotations. Stuff is background, unless the label set has its class.
+        A segment of stuff with several classes is background.
 
-    Segments that are not `tracked` may have another class in each frame.
-    """
+        Raises:
+            InputError: A segment has different classes in two frames, so ids are not tracked.
+        """
+        first: dict[int, tuple[str, str]] = {}
+        for stem, classes in self.of_frame.items():
+            for number, name in classes.items():
+                before, where = first.setdefault(number, (name, stem))
+                if before != name and {before, name} <= self.stuff:
+                    first[number] = _BACKGROUND, where
+                elif before != name:
+                    raise InputError(
+                        f"{path}: segment {self.segments[number - 1]} is {before} in '{where}', "
+                        f"but {name} in '{stem}'. Ids must be tracked: the same object has the "
+                        "same id in all frames, as video segmenters write them; else pass "
+                        "--tracks auto."
+                    )
+        return {number: name for number, (name, _) in first.items()}
+
+
+def read_panoptic(path: Path, label_set_name: str) -> PanopticIds:
+    """Read a room's annotations. Stuff is no object, unless the label set has its class."""
     room = checked(_Panoptic, read_json(path), str(path))
-    names = {
-        item.id: item.name
-        if item.isthing or tidy(item.name) in map(tidy, label_set(label_set_name))
-        else _STUFF
-        for item in room.categories
-    }
-    of_id: dict[int, tuple[str, str]] = {}
+    own = {tidy(name) for name in label_set(label_set_name)}
+    stuff = frozenset({_BACKGROUND, *STUFF[1:]} - own)
+    names = {}
+    for item in room.categories:
+        if item.isthing or tidy(item.name) in own:
+            names[item.id] = item.name
+        else:
+            name = STUFF[stuff_of(item.name)]
+            names[item.id] = name if name in stuff else _BACKGROUND
     by_frame: dict[str, dict[int, str]] = {}
     for frame in room.annotations:
         for segment in frame.segments_info:
@@ -97,23 +156,14 @@ def read_panoptic(path: Path, label_set_name: str, tracked: bool = True) -> Pano
                     f"{path}, '{frame.file_name}': category {segment.category_id} of segment "
                     f"{segment.id} is not among its categories."
                 )
-            name = _CROWD if segment.iscrowd else names[segment.category_id]
+            name = CROWD if segment.iscrowd else names[segment.category_id]
             by_frame.setdefault(Path(frame.file_name).stem, {})[segment.id] = name
-            before, where = of_id.setdefault(segment.id, (name, frame.file_name))
-            if tracked and before != name:
-                raise InputError(
-                    f"{path}: segment {segment.id} is {before} in '{where}', but {name} in "
-                    f"'{frame.file_name}'. Ids must be tracked: the same object has the same id "
-                    "in all frames, as video segmenters write them; else pass --tracks auto."
-                )
-    of_id.pop(0, None)
-    if not of_id or len(of_id) >= LARGEST_ID:
-        raise InputError(f"{path} has {len(of_id)} segments; expected 1 to {LARGEST_ID - 1}.")
-    segments = sorted(of_id)
-    classes = {k + 1: of_id[segment][0] for k, segment in enumerate(segments)}
+    segments = sorted({k for names in by_frame.values() for k in names} - {0})
+    if not 0 < len(segments) < LARGEST_ID:
+        raise InputError(f"{path} has {len(segments)} segments; expected 1 to {LARGEST_ID - 1}.")
     number = {segment: k + 1 for k, segment in enumerate(segments)}
     of_frame = {
         stem: {number[segment]: name for segment, name in names.items() if segment}
         for stem, names in by_frame.items()
     }
-    return PanopticIds(np.array(segments), classes, of_frame)
+    return PanopticIds(np.array(segments), of_frame, stuff)

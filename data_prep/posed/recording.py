@@ -82,10 +82,15 @@ class PosedFrame:
     camera_to_world: np.ndarray
     """(4, 4) float64 as written: OpenGL axes (x right, y up, z backward), in the file's units."""
     instances: Path
-    """PNG of tracked ids; it may be missing."""
+    """PNG of ids, if masks are PNGs; it may be missing."""
     known: Path | None
     """PNG from `mask_path`; 0 marks pixels with unknown ids."""
     camera: Camera
+
+    @property
+    def stem(self) -> str:
+        """Name without folders and ending, under which segmenters store the masks."""
+        return Path(_as_png(self.name)).stem
 
 
 @dataclass(frozen=True)
@@ -101,8 +106,8 @@ class Recording:
     floor_center_m: tuple[float, float] | None
     """Centre of the floor along the two horizontal axes in their order, metres."""
     metres_per_unit: float | None
-    leveled: bool = True
-    """True if an axis of the poses' world points up; COLMAP's worlds have any orientation."""
+    up: str = "z"
+    """Axis of the poses' world that points up; `cameras` if none does, as in COLMAP's worlds."""
 
 
 def path_text(name: str) -> str:

@@ -1,18 +1,19 @@
 """Source for folders of posed pictures; a folder with poses and masks is a room."""
 
-from collections import Counter
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
 from data_prep.engine.plan import digest, digest_of_files
-from data_prep.engine.selection import house_may_match, seeded_split, select
+from data_prep.engine.selection import house_may_match, of_one_size, seeded_split, select
 from data_prep.engine.source import Expected, Line, PreparedRoom, RoomTask, Survey, sentence_of
 from data_prep.engine.workers import Run
 from data_prep.posed.cameras import seems_up
+from data_prep.posed.formats import Formats, mask_files
 from data_prep.posed.labels import TABLES
-from data_prep.posed.recording import INSTANCES, room_name
-from data_prep.posed.transforms import FILE_NAME, read_recording, room_files
+from data_prep.posed.mask_format import MaskFormat
+from data_prep.posed.recording import INSTANCES, Recording, room_name
+from data_prep.posed.transforms import POSES, pose_files, read_recording
 from data_prep.posed.views import PosedSettings, prepare_posed, stored_size
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
@@ -35,6 +36,8 @@ class PosedSource:
     """Share of rooms in the split `test`, at least one of several; 0 puts all rooms in `train`."""
     seed: int = 0
     only: str | None = None
+    formats: Formats = field(default_factory=Formats)
+    """The tools that wrote the poses and the masks."""
 
     def settings(self, only: str | None) -> dict[str, Any]:
         """See `Source.settings`.
@@ -47,20 +50,23 @@ class PosedSource:
             raise InputError(
                 f"test_share is {self.test_share}; expected a share from 0 to below 1."
             )
-        rooms = [path for path in find_rooms(self.folder) if house_may_match(only, room_name(path))]
+        rooms = [path for path in self._rooms() if house_may_match(only, room_name(path))]
         if not rooms:
             raise InputError(f"{self.folder} has no room '{only}' (--only takes a room's folder).")
         files = {
             room_name(room): digest_of_files(
-                room_files(room)
+                pose_files(room, self.formats.poses)[1]
                 + [room / name for name in TABLES if (room / name).is_file()]
-                + sorted((room / INSTANCES).rglob("*.png"))
-                + sorted((room / INSTANCES).rglob("*.json"))
+                + mask_files(room)
             )
             for room in rooms
         }
         return {
-            "recipe": {"label_set": self.label_set, **asdict(self.posed_settings)},
+            "recipe": {
+                "label_set": self.label_set,
+                "from": asdict(self.formats),
+                **asdict(self.posed_settings),
+            },
             "seed": self.seed,
             "test_share": self.test_share,
             "rooms": digest(repr(sorted(files.items()))),
@@ -68,7 +74,7 @@ class PosedSource:
 
     def survey(self, run: Run) -> Survey:
         """Read every room's poses and the size of its masks."""
-        rooms = find_rooms(self.folder)
+        rooms = self._rooms()
         sizes: dict[str, tuple[int, int]] = {}
         left_out: list[Line] = []
         looked = run(_look, [(self, room) for room in rooms], "reading rooms")
@@ -78,16 +84,8 @@ class PosedSource:
                 left_out.append(Line(name, name, "failed", reason=found))
             else:
                 sizes[name] = found
-        # Batches hold images of several rooms, so all must have one size.
-        usual = Counter(sizes.values()).most_common(1)[0][0] if sizes else (0, 0)
-        for name, size in sizes.items():
-            if size != usual:
-                why = (
-                    f"its views are {size[1]} x {size[0]} pixels, those of most rooms {usual[1]} x "
-                    f"{usual[0]}, and all shards of a folder need one size; prepare it separately"
-                )
-                left_out.append(Line(name, name, "filtered", "image_size", why))
-        names = [name for name, size in sizes.items() if size == usual]
+        names, others = of_one_size(sizes)
+        left_out += others
         split_of = seeded_split(names, self.seed, self.test_share)
         tasks = tuple(RoomTask(name, name, split_of[name]) for name in names)
         survey = Survey(tasks, tuple(left_out))
@@ -95,26 +93,47 @@ class PosedSource:
 
     def prepare(self, task: RoomTask, renderer: Renderer | None) -> PreparedRoom | Line:
         """Read one room and label its views."""
-        folders = {room_name(room): room for room in find_rooms(self.folder)}
+        folders = {room_name(room): room for room in self._rooms()}
         if task.house not in folders:
             raise InputError(f"{self.folder} no longer has this room; restore its folder.")
-        recording = read_recording(folders[task.house])
-        made = prepare_posed(recording, self.label_set, self.posed_settings)
+        recording, masks = self.open(folders[task.house])
+        made = prepare_posed(recording, masks, self.posed_settings)
         if made is None:
             why = f"none of its {len(recording.frames)} frames shows any object"
             return Line(task.room_id, task.house, "filtered", "no_view", why)
         return made
 
+    def _rooms(self) -> list[Path]:
+        return find_rooms(self.folder, self.formats.poses)
+
+    def open(self, room: Path) -> tuple[Recording, MaskFormat]:
+        """Poses and masks of a room's folder."""
+        recording = read_recording(room, self.formats.poses)
+        return recording, self.formats.masks_of(room, self.label_set)
+
+    def found(self) -> list[str]:
+        """Sentences that name the tools whose files were found, for formats that were guessed."""
+        return self.formats.found(self._rooms())
+
     def assumptions(self) -> list[str]:
         """Sentences about values that the files lack and that are assumed, to print first."""
-        recordings = []
-        for room in find_rooms(self.folder):
+        recordings: list[Recording] = []
+        untracked: list[str] = []
+        for room in self._rooms():
             try:
-                recordings.append(read_recording(room))
+                recording, masks = self.open(room)
+                untracked += [] if masks.tracked else [masks.title]
             except InputError:
                 continue  # the report will have the error
+            recordings.append(recording)
         settings, count = self.posed_settings, len(recordings)
         sentences = []
+        if untracked and settings.tracks != "auto":
+            sentences.append(
+                f"In {len(untracked)} of {count} rooms ids belong to single images "
+                f"({untracked[0]}): objects are found from poses, masks and classes, as with "
+                "--tracks auto."
+            )
         unknown = sum(recording.floor_m is None for recording in recordings)
         if unknown and settings.floor_m is None:
             sentences.append(
@@ -130,7 +149,7 @@ class PosedSource:
                 f"{unknown} of {count} rooms give no metres_per_unit: poses are assumed to be in "
                 "metres, which COLMAP's are not."
             )
-        lying = sum(not recording.leveled for recording in recordings)
+        lying = sum(recording.up == "cameras" for recording in recordings)
         if lying and settings.up == "auto":
             sentences.append(
                 f"{lying} of {count} rooms do not state the up direction: it is estimated from the "
@@ -138,37 +157,44 @@ class PosedSource:
                 "error is 1.3 degrees, and floors rise by 5 cm in 2 m. Turn the poses until an "
                 "axis points up, and name it with --up."
             )
-        taken = "z" if settings.up == "auto" else settings.up
-        tops = [seems_up(recording) for recording in recordings if recording.leveled]
-        other = sum(axis not in (None, taken) for axis in tops)
-        if other and taken != "cameras":
-            axis = "y" if taken == "z" else "z"
-            sentences.append(
-                f"In {other} of {count} rooms the tops of the pictures point along {axis}, but "
-                f"{taken} is taken as up: is it --up {axis}?"
-            )
+        for taken, axis in (("z", "y"), ("y", "z")):
+            tops = [
+                seems_up(recording)
+                for recording in recordings
+                if recording.up != "cameras"
+                and taken == (recording.up if settings.up == "auto" else settings.up)
+            ]
+            if other := tops.count(axis):
+                sentences.append(
+                    f"In {other} of {count} rooms the tops of the pictures point along {axis}, but "
+                    f"{taken} is taken as up: is it --up {axis}?"
+                )
         return sentences
 
 
-def find_rooms(folder: Path) -> list[Path]:
-    """Find rooms: the folder itself if it holds poses (`room_files`), else its sub-folders, sorted.
+def find_rooms(folder: Path, poses: str | None = None) -> list[Path]:
+    """Find rooms: the folder itself if it holds poses (`pose_files`), else its sub-folders, sorted.
 
     Sub-folders with `instances/` but no poses are included, so that the report mentions them.
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise InputError(f"No folder at {folder}; prep-posed reads a folder of rooms.")
-    if room_files(folder):
+        raise InputError(
+            f"No folder at {folder}; prep-posed reads a folder of rooms, unpacked from a .zip or "
+            ".r3d file."
+        )
+    if pose_files(folder, poses)[1]:
         return [folder]
     found = [
         path
         for path in sorted(folder.iterdir())
-        if path.is_dir() and (room_files(path) or (path / INSTANCES).is_dir())
+        if path.is_dir() and (pose_files(path, poses)[1] or (path / INSTANCES).is_dir())
     ]
     if not found:
+        tools = POSES.values() if poses is None else [POSES[poses]]
         raise InputError(
-            f"{folder} holds no {FILE_NAME} and no model of COLMAP (sparse/0), and none of its "
-            "sub-folders does."
+            f"{folder} holds no poses of {', '.join(tools)}, and none of its sub-folders does "
+            "(unpack .zip and .r3d files)."
         )
     return found
 
@@ -176,7 +202,6 @@ def find_rooms(folder: Path) -> list[Path]:
 def _look(source: PosedSource, room: Path) -> tuple[int, int] | str:
     """Size at which a room would be stored, or the reason why it cannot be prepared."""
     try:
-        recording = read_recording(room)
-        return stored_size(recording, source.posed_settings)
+        return stored_size(*source.open(room), source.posed_settings)
     except Exception as error:
         return sentence_of(error)

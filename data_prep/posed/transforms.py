@@ -1,12 +1,14 @@
-"""Reads a room's files: nerfstudio-style transforms.json, its split files, or a COLMAP model.
+"""Reads a room's poses: nerfstudio-style transforms.json, its split files, or other tools' files.
 
 The keys of a JSON are `frames`, camera keys (see Camera) for all frames, `floor_m`,
 `floor_center_m` and `metres_per_unit`. The keys of a frame are `file_path`, `transform_matrix`,
 `instance_path`, `mask_path`, and camera keys, which override the file's. Other keys are ignored,
-and the pictures themselves are never opened.
+and the pictures themselves are never opened. Beside another tool's poses, only the keys of the room
+are read.
 """
 
 import contextlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,6 +16,8 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from data_prep.posed.colmap import model_files, read_model
+from data_prep.posed.polycam import polycam_files, read_keyframes
+from data_prep.posed.record3d import read_metadata, record3d_files
 from data_prep.posed.recording import (
     Camera,
     Number,
@@ -45,53 +49,99 @@ class _RoomEntry(BaseModel):
     metres_per_unit: Annotated[Number, Field(gt=0)] | None = None
 
 
-def room_files(folder: Path) -> list[Path]:
-    """Files that the poses of a room are read from; empty if the folder is not a room.
+POSES = {
+    "nerfstudio": f"nerfstudio ({FILE_NAME})",
+    "colmap": "COLMAP (sparse/)",
+    "polycam": "Polycam (keyframes/)",
+    "record3d": "Record3D (metadata)",
+}
+"""Formats of poses: the value of `--from`, and the tool's name with its files."""
+_UP = {"nerfstudio": "z", "colmap": "cameras", "polycam": "y", "record3d": "cameras"}
+_IN_METRES = ("polycam", "record3d")
 
-    They are transforms.json; else transforms_*.json (one per split); else the files of a COLMAP
-    model, with an optional transforms.json that has no frames but keys about the room.
+
+def pose_files(folder: Path, given: str | None = None) -> tuple[str, list[Path]]:
+    """Format of a room's poses, and the files that they are read from.
+
+    The list is empty if the folder is not a room. If `given` is None, the format is guessed:
+    transforms.json, or else transforms_*.json (one per split), is preferred to a COLMAP model,
+    beside which nerfstudio writes it. Other tools' poses may have a transforms.json without frames,
+    but with keys about the room.
     """
     whole = folder / FILE_NAME
-    parts = sorted(folder.glob("transforms_*.json"))
-    model = model_files(folder)
-    if model is None or parts:
-        return [whole] if whole.is_file() else parts
-    if not whole.is_file():
-        return [*model]
+    of_room = [whole] if whole.is_file() else []
+    found = {
+        "colmap": [*(model_files(folder) or ())],
+        "polycam": polycam_files(folder),
+        "record3d": record3d_files(folder),
+    }
+    found = {name: [*files, *of_room] for name, files in found.items() if files}
+    own = of_room or sorted(folder.glob("transforms_*.json"))
+    if own and not (of_room and found and _has_no_frames(whole)):
+        found["nerfstudio"] = own
+        if given != "colmap":
+            found.pop("colmap", None)
+    if given is not None:
+        return given, found.get(given, [])
+    if len(found) > 1:
+        raise InputError(
+            f"{folder} has poses of {' and of '.join(POSES[name] for name in sorted(found))}; "
+            f"choose with --from {' or --from '.join(sorted(found))}."
+        )
+    return next(iter(found.items()), ("nerfstudio", []))
+
+
+def _has_no_frames(whole: Path) -> bool:
     try:
         data = read_json(whole)
     except InputError:
-        return [whole]  # reading it will raise the error
-    return [*model, whole] if isinstance(data, dict) and "frames" not in data else [whole]
+        return False  # reading it will raise the error
+    return isinstance(data, dict) and "frames" not in data
 
 
-def read_recording(folder: Path) -> Recording:
-    """Read the frames of one room (`room_files`); errors name the file, the frame and the key."""
-    files = room_files(Path(folder)) or [Path(folder) / FILE_NAME]
-    jsons = [(path, read_json(path)) for path in files if path.suffix == ".json"]
-    rooms = [(path, checked(_RoomEntry, data, str(path))) for path, data in jsons]
-    model = [path for path in files if path.suffix != ".json"]
+def read_recording(folder: Path, given: str | None = None) -> Recording:
+    """Read the frames of one room (`pose_files`); errors name the file, the frame and the key."""
+    folder = Path(folder)
+    name, files = pose_files(folder, given)
+    if not files and name != "nerfstudio":
+        raise InputError(f"{folder} has no poses of {POSES[name]}; leave out --from to guess.")
+    files = files or [folder / FILE_NAME]
+    jsons = [(path, read_json(path)) for path in files if name == "nerfstudio"]
+    rooms = jsons or [(path, read_json(path)) for path in files if path == folder / FILE_NAME]
+    of_room = [(path, checked(_RoomEntry, data, str(path))) for path, data in rooms]
     frames: list[PosedFrame] = []
-    if model:
-        for image in read_model(model[0], model[1]):
-            camera = checked(Camera, image.camera, f"{model[1]}, image {shown(image.name)}")
-            ids = ids_path(Path(folder), image.name)
-            frames.append(PosedFrame(image.name, image.camera_to_world, ids, None, camera))
-        if not frames:
-            raise InputError(f"{model[1]} has no image with a pose.")
-    else:
-        for path, data in jsons:
-            frames += _frames(path, data)
+    for path, data in jsons:
+        frames += _frames(path, data)
+    if name != "nerfstudio":
+        own = [path for path in files if path != folder / FILE_NAME]
+        for picture, pose, camera in _posed(name, own):
+            frames.append(PosedFrame(picture, pose, ids_path(folder, picture), None, camera))
     check_one_png_a_frame(files[0], tuple(frames))
+    metres_per_unit = _one("metres_per_unit", of_room)
     return Recording(
-        Path(folder),
+        folder,
         files[0],
         tuple(frames),
-        _one("floor_m", rooms),
-        _one("floor_center_m", rooms),
-        _one("metres_per_unit", rooms),
-        leveled=not model,
+        _one("floor_m", of_room),
+        _one("floor_center_m", of_room),
+        1.0 if metres_per_unit is None and name in _IN_METRES else metres_per_unit,
+        _UP[name],
     )
+
+
+def _posed(name: str, files: list[Path]) -> Iterator[tuple[str, np.ndarray, Camera]]:
+    """Picture, pose and camera of each frame of another tool's files."""
+    if name == "polycam":
+        yield from read_keyframes(files)
+    elif name == "record3d":
+        yield from read_metadata(files[0])
+    else:
+        images = read_model(*files)
+        if not images:
+            raise InputError(f"{files[1]} has no image with a pose.")
+        for image in images:
+            where = f"{files[1]}, image {shown(image.name)}"
+            yield image.name, image.camera_to_world, checked(Camera, image.camera, where)
 
 
 def _one(key: str, rooms: list[tuple[Path, _RoomEntry]]) -> Any:

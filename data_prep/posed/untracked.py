@@ -1,42 +1,29 @@
 """Reads masks whose ids are not consistent across frames, and finds the objects that they show."""
 
-from pathlib import Path
-
 import numpy as np
 
-from data_prep.posed.labels import find_table
+from data_prep.posed.mask_format import MaskFormat
 from data_prep.posed.masks import MaskPixels
-from data_prep.posed.panoptic import FILE_NAME as PANOPTIC
-from data_prep.posed.panoptic import read_panoptic
 from data_prep.posed.recording import PosedFrame
 from data_prep.tracks.associate import UNKNOWN, FrameMasks, Tracks, associate
 from sceneprior.core.classes import VOID
 from sceneprior.core.errors import InputError
-from sceneprior.core.instances.pngs import read_mask
-from sceneprior.core.instances.tables import LARGEST_ID, IdTable, read_class_table
+from sceneprior.core.instances.tables import LARGEST_ID, IdTable
 
 
 class UntrackedMasks:
-    """Reads the masks of one room, whose ids and classes belong to single frames.
+    """Reads the masks of one room, whose ids and classes belong to single frames."""
 
-    The classes of a frame's ids are read from a JSON beside the PNG with the same stem, in any form
-    of `read_class_table`, or else from the room's table.
-    """
-
-    def __init__(
-        self, folder: Path, label_set_name: str, size: tuple[int, int], stored: tuple[int, int]
-    ):
-        self._folder, self._label_set = folder, label_set_name
-        self._table: dict[int, str] | None = None
-        self._panoptic = None
-        if (folder / PANOPTIC).is_file():
-            self._panoptic = read_panoptic(find_table(folder), label_set_name, tracked=False)
+    def __init__(self, masks: MaskFormat, size: tuple[int, int], stored: tuple[int, int]):
+        self._masks = masks
         self.notes: list[str] = []
-        read = read_mask if self._panoptic is None else self._panoptic.read
-        self._pixels = MaskPixels(read, size, stored)
+        self._pixels = MaskPixels(masks, size, stored)
 
-    def read(self, frames: list[PosedFrame]) -> tuple[FrameMasks, np.ndarray, np.ndarray]:
-        """Masks of all frames, their original ids, (masks,), and intrinsics, (frames, 3, 3)."""
+    def read(
+        self, frames: list[PosedFrame]
+    ) -> tuple[FrameMasks, np.ndarray, np.ndarray, np.ndarray]:
+        """Masks of all frames, their original ids, (masks,), the stuff in all frames, and
+        intrinsics, (frames, 3, 3)."""
         images, intrinsics = (
             np.stack(arrays)
             for arrays in zip(*(self._pixels.read(frame) for frame in frames), strict=True)
@@ -45,7 +32,7 @@ class UntrackedMasks:
         class_names: dict[int, str] = {}
         original_ids, unlisted = [0], 0
         for image, number, frame in zip(images, numbers, frames, strict=True):
-            names = self._classes(frame)
+            names = self._masks.frame_classes(frame)
             for k in np.unique(image[image > 0]).tolist():
                 if k not in names:
                     number[image == k] = -1
@@ -56,10 +43,10 @@ class UntrackedMasks:
                 original_ids.append(k)
         if (count := len(original_ids)) > LARGEST_ID:
             raise InputError(
-                f"{self._folder} has {count - 1} masks, expected at most {LARGEST_ID - 1}; use "
-                "fewer frames (--max-views)."
+                f"{self._masks.folder} has {count - 1} masks, expected at most {LARGEST_ID - 1}; "
+                "use fewer frames (--max-views)."
             )
-        table = IdTable(class_names, self._label_set, str(self._folder))
+        table = IdTable(class_names, self._masks.label_set_name, str(self._masks.folder))
         ids = table.ids(numbers).astype(np.int32)
         # The table's last id is that of masks without a class. Their content is unknown.
         ids[ids == len(table.classes)] = UNKNOWN
@@ -73,24 +60,7 @@ class UntrackedMasks:
         if unlisted:
             self.notes.append(f"{unlisted} masks have no class in their frame's table: void")
         masks = FrameMasks(ids, table.classes[kept - 1].astype(np.int64))
-        return masks, np.array(original_ids)[number_of_id[1:]], intrinsics
-
-    def _classes(self, frame: PosedFrame) -> dict[int, str]:
-        """Class of each id of a frame."""
-        if self._panoptic is not None:
-            return self._panoptic.of_frame.get(frame.instances.stem, {})
-        own = frame.instances.with_suffix(".json")
-        if own.is_file():
-            return read_class_table(own)
-        if self._table is None:
-            try:
-                self._table = read_class_table(find_table(self._folder))
-            except InputError as error:
-                raise InputError(
-                    f"{str(error).removesuffix('.')}; or put the classes of a frame's ids into "
-                    f"{own.name} beside its PNG."
-                ) from None
-        return self._table
+        return masks, np.array(original_ids)[number_of_id[1:]], table.stuff(numbers), intrinsics
 
 
 def track(

@@ -1,20 +1,22 @@
 """Labels the views of one posed room and returns the arrays stored in shards."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from data_prep.engine.source import PreparedRoom
-from data_prep.frames import choose_frames, first_fault, room_cameras
+from data_prep.frames import choose_frames, first_fault, room_cameras, shrunk
 from data_prep.posed.cameras import UP, cameras_in_room, upright_cameras
 from data_prep.posed.floor import find_floor
-from data_prep.posed.masks import RoomMasks, png_size
+from data_prep.posed.mask_format import MaskFormat
+from data_prep.posed.masks import RoomMasks
 from data_prep.posed.recording import PosedFrame, Recording, room_name
 from data_prep.posed.untracked import UntrackedMasks, track
 from sceneprior.core.errors import InputError
 from sceneprior.core.instances.checked import shown
 from sceneprior.core.instances.observations import Observations, observe
+from sceneprior.core.shards import stuff_step, thinned
 
 TRACKS = ("given", "auto")
 _MANY_IDS, _MANY_FRAMES, _ONCE = 12, 5, 0.8
@@ -59,60 +61,61 @@ class PosedSettings:
             raise InputError(f"floor_m is {self.floor_m}; expected a height in metres.")
 
 
-def usable_frames(recording: Recording) -> list[PosedFrame]:
-    """Frames with a PNG of ids, in the file's order; their poses may be invalid."""
-    frames = [frame for frame in recording.frames if frame.instances.is_file()]
+def usable_frames(recording: Recording, masks: MaskFormat) -> list[PosedFrame]:
+    """Frames with masks, in the file's order; their poses may be invalid."""
+    frames = [frame for frame in recording.frames if masks.has(frame)]
     if not frames:
         raise InputError(
-            f"{recording.path}: none of its {len(recording.frames)} frames has a PNG of instance "
-            f"ids; expected {recording.frames[0].instances}."
+            f"{recording.path}: none of its {len(recording.frames)} frames has a mask; expected "
+            f"{masks.wanted(recording.frames[0])}."
         )
     return frames
 
 
-def stored_size(recording: Recording, settings: PosedSettings) -> tuple[int, int]:
-    """Size, (height, width), at which a room is stored: that of its PNGs, limited by `max_side`."""
-    height, width = png_size(recording.folder, usable_frames(recording)[0])
-    shrink = 1.0 if settings.max_side is None else min(1, settings.max_side / max(height, width))
-    return max(1, round(height * shrink)), max(1, round(width * shrink))
+def stored_size(
+    recording: Recording, masks: MaskFormat, settings: PosedSettings
+) -> tuple[int, int]:
+    """Size, (height, width), at which a room is stored: its masks', limited by `max_side`."""
+    return shrunk(masks.size(usable_frames(recording, masks)[0]), settings.max_side)
 
 
 def prepare_posed(
-    recording: Recording, label_set_name: str, settings: PosedSettings
+    recording: Recording, masks: MaskFormat, settings: PosedSettings
 ) -> PreparedRoom | None:
     """Label the views of one room; None if no view shows an object of the label set."""
-    size = png_size(recording.folder, usable_frames(recording)[0])
+    usable = usable_frames(recording, masks)
+    size = masks.size(usable[0])
     poses = np.stack([frame.camera_to_world for frame in recording.frames])
-    with_mask = [i for i, frame in enumerate(recording.frames) if frame.instances.is_file()]
+    with_mask = [i for i, frame in enumerate(recording.frames) if masks.has(frame)]
     choice = choose_frames(poses, with_mask, 1, settings.max_views)
     if not choice.frames:
         bad = first_fault(poses)
         fault = f"; frame {shown(recording.frames[bad[0]].name)}: {bad[1]}" if bad else ""
         raise InputError(
             f"{recording.path} has no usable frame: {choice.bad_poses} of {choice.candidates} have "
-            f"no usable pose (a rotation with a translation), {choice.without_mask} no PNG of ids"
+            f"no usable pose (a rotation with a translation), {choice.without_mask} no mask"
             f"{fault}."
         )
-    notes = choice.notes("PNG")
-    stored = stored_size(recording, settings)
+    notes = choice.notes("mask")
+    stored = stored_size(recording, masks, settings)
     frames = [recording.frames[i] for i in choice.frames]
     unit = settings.metres_per_unit
     upright, turn = upright_cameras(recording, [*choice.frames], settings.up, unit)
     try:
-        if settings.tracks == "auto":
-            untracked = UntrackedMasks(recording.folder, label_set_name, size, stored)
-            given, ids, intrinsics = untracked.read(frames)
+        if settings.tracks == "auto" or not masks.tracked:
+            untracked = UntrackedMasks(masks, size, stored)
+            given, ids, stuff, intrinsics = untracked.read(frames)
             cameras = room_cameras(upright, np.eye(4))
             images, classes, said = track(given, ids, cameras, intrinsics)
             notes += [*untracked.notes, said]
         else:
-            masks = RoomMasks(recording.folder, label_set_name, size, stored)
-            images, intrinsics = (
+            tracked = RoomMasks(masks, size, stored)
+            images, stuff, intrinsics = (
                 np.stack(arrays)
-                for arrays in zip(*(masks.read(frame) for frame in frames), strict=True)
+                for arrays in zip(*(tracked.read(frame) for frame in frames), strict=True)
             )
-            notes += masks.notes
-            classes = masks.table.classes
+            notes += tracked.notes
+            classes = tracked.table.classes
             _check_tracked(images, len(classes))
     except InputError as error:
         raise InputError(f"{recording.path}: {str(error).removesuffix('.')}.") from None
@@ -125,6 +128,9 @@ def prepare_posed(
         notes.append(said)
     world_to_camera = cameras_in_room(recording, upright, turn, floor)
     views = seen.room_views(room_name(recording.folder), world_to_camera, intrinsics)
+    if stuff.any():
+        small = (..., *thinned(stuff_step(views.image_size)))
+        views = replace(views, stuff=stuff[small] * (seen.instance_ids[small] == 0))
     room_from_world = np.linalg.inv(upright[0] @ world_to_camera[0]) @ turn
     origin = {
         "file": recording.path.relative_to(recording.folder).as_posix(),

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from data_prep.frames import (
+    Y_UP,
     FrameChoice,
     choose_frames,
     first_fault,
@@ -31,9 +32,6 @@ from sceneprior.core.scene import Mesh
 FULL_SIZE = (968, 1296)
 QUARTER_SIZE = (242, 324)
 """(height, width) of ScanNet's colour frames, and a quarter of it, the paper's rendering size."""
-
-_Y_UP = np.array([[0.0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
-"""Maps (x, y, z) with z up to (y, z, x) with y up; stays right-handed."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +117,7 @@ def read_scan(folder: Path, labels: Labels, settings: ScanSettings | None = None
     name = folder.name
     properties_path = folder / f"{name}.txt"
     properties = read_properties(properties_path)
-    aligned = _Y_UP @ axis_alignment(properties_path, properties)
+    aligned = Y_UP @ axis_alignment(properties_path, properties)
     groups, notes = read_groups(folder / f"{name}.aggregation.json")
     if "axisAlignment" not in properties:
         notes.append(

@@ -16,7 +16,6 @@ from sceneprior.core.scene import Scene
 from sceneprior.core.scene_json import FORMAT
 from sceneprior.core.shell import ShellName
 from sceneprior.paper.sampling import LATENTS_FILE, write_latents
-from sceneprior.render.offscreen import Renderer
 from sceneprior.render.pictures import contact_sheet, png_bytes
 from sceneprior.render.scene_files import check_names, format_of, save_scene
 from sceneprior.render.topdown import perspective, room_view
@@ -27,15 +26,13 @@ OVERVIEW_TILE = (240, 320)
 """Height and width of one room of the overview, in pixels."""
 
 
-def write_scene(
-    scene: Scene, folder: Path, name: str, renderer: Renderer, shell: ShellName = "none"
-) -> None:
+def write_scene(scene: Scene, folder: Path, name: str, shell: ShellName = "none") -> None:
     """Write `<name>.glb`, `<name>.png` and `<name>.json`; see `save_scene`.
 
     The JSON is written last, so that a JSON implies that the other two files exist.
     """
     for ending in (".glb", ".png", ".json"):
-        save_scene(scene, Path(folder) / f"{name}{ending}", renderer, shell)
+        save_scene(scene, Path(folder) / f"{name}{ending}", shell)
 
 
 def check_free(folder: Path, overwrite: bool = False) -> None:
@@ -64,9 +61,7 @@ def clear_scenes(folder: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def write_scenes(
-    scenes: Sequence[Scene], folder: Path, renderer: Renderer, shell: ShellName = "none"
-) -> None:
+def write_scenes(scenes: Sequence[Scene], folder: Path, shell: ShellName = "none") -> None:
     """Write scenes under their own names, replacing the scenes of a folder.
 
     `overview.png` shows the first few, and `latents.npz` is written if all scenes are decoded from
@@ -75,18 +70,17 @@ def write_scenes(
     check_names(scenes)
     clear_scenes(folder)
     with ThreadPoolExecutor(os.cpu_count()) as pool, Progress(console=Console(stderr=True)) as bar:
-        # Drawing, compression and disk access run in parallel, except that GL has one thread.
-        each = pool.map if renderer.kind == "software" else map
-        done = each(lambda scene: write_scene(scene, folder, scene.name, renderer, shell), scenes)
+        # Drawing, compression and disk access run in parallel.
+        done = pool.map(lambda scene: write_scene(scene, folder, scene.name, shell), scenes)
         for _ in bar.track(done, total=len(scenes), description="Writing scenes"):
             pass
-    sheet = overview(scenes[:OVERVIEW_ROOMS], renderer, shell)
+    sheet = overview(scenes[:OVERVIEW_ROOMS], shell)
     write_whole(Path(folder) / "overview.png", png_bytes(sheet))
     write_latents(folder, scenes)
 
 
 def overview(
-    scenes: Sequence[Scene], renderer: Renderer, shell: ShellName = "none"
+    scenes: Sequence[Scene], shell: ShellName = "none"
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Contact sheet of one or more rooms from above a corner, four per row, coloured by class.
 
@@ -94,7 +88,6 @@ def overview(
     """
     views = [room_view(scene, OVERVIEW_TILE) if shell == "walls" else None for scene in scenes]
     tiles = [
-        perspective(scene, renderer, OVERVIEW_TILE, view)
-        for scene, view in zip(scenes, views, strict=True)
+        perspective(scene, OVERVIEW_TILE, view) for scene, view in zip(scenes, views, strict=True)
     ]
     return contact_sheet(tiles, min(4, len(tiles)))

@@ -37,6 +37,9 @@ LABEL_SETS |= {
     "front3d_all": LABEL_SETS["front3d_bedroom"],  # includes all classes of living rooms
 }  # fmt: skip
 
+STUFF = ("unknown", "floor", "wall", "door", "window", "ceiling")
+"""Classes of the room itself, by their value in `RoomViews.stuff`."""
+
 VOID = 0
 """Index of `void` in every label set: the class of furniture that belongs to no other class."""
 

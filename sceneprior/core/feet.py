@@ -7,7 +7,7 @@ import shapely
 from jaxtyping import Float
 
 from sceneprior.core.colliders import colliders, mesh_of, points_of, volume_and_centroid
-from sceneprior.core.scene import Mesh, SceneObject, Solid
+from sceneprior.core.scene import Mesh, SceneObject, Solid, Textured
 
 CONTACT_M = 1e-3
 """Height above the lowest point up to which a body touches the floor."""
@@ -36,7 +36,8 @@ def with_feet(item: SceneObject) -> SceneObject:
     bodies = colliders(item)
     feet = _feet(bodies)
     mesh = item.mesh and _joined(item.mesh, *map(mesh_of, feet))
-    return replace(item, solids=(*bodies, *feet), mesh=mesh)
+    textured = item.textured and (*item.textured, *(Textured(mesh_of(foot)) for foot in feet))
+    return replace(item, solids=(*bodies, *feet), mesh=mesh, textured=textured)
 
 
 def stands_safely(item: SceneObject) -> bool:

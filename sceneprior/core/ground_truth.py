@@ -1,7 +1,5 @@
 """Reference scenes: the ground-truth rooms of shards, and random baselines drawn from them."""
 
-import hashlib
-import json
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -121,22 +119,6 @@ def shuffled_rooms(
 
 def _at(item: SceneObject, x: float, z: float) -> SceneObject:
     return replace(item.in_box((x, item.center_m[1], z), item.size_m), turned=item.turned)
-
-
-def split_fingerprint(shards: Path, split: str) -> str:
-    """SHA-256 of everything that renderings of a split depend on: ids, objects, model files."""
-    digest = hashlib.sha256()
-    models: set[str] = set()
-    for shard, room_id in iterate_rooms(shards, split):
-        truth = shard.read_ground_truth(room_id)
-        digest.update(json.dumps([shard.label_set, room_id, truth.model_ids]).encode())
-        for array in (truth.object_class, truth.centers_m, truth.sizes_m, truth.model_to_room):
-            digest.update(np.ascontiguousarray(array).tobytes())
-        models.update(model_id for model_id in truth.model_ids if model_id)
-    for model_id in sorted(models):
-        path = model_path(Path(shards), model_id)
-        digest.update(hashlib.sha256(path.read_bytes() if path.is_file() else b"").digest())
-    return digest.hexdigest()
 
 
 def reference_scene(

@@ -4,7 +4,7 @@ import base64
 import html
 import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -57,6 +57,16 @@ def mesh_of_file(vertices_m: np.ndarray, faces: np.ndarray) -> Mesh:
     return mesh
 
 
+class Textured(NamedTuple):
+    """A part of an object's mesh that has one material."""
+
+    mesh: Mesh
+    material: Any = None
+    """A `PBRMaterial` of trimesh; None for the colour of the object's class."""
+    uv: np.ndarray | None = None
+    """(V, 2) texture coordinates of the vertices, with the origin at the lower left."""
+
+
 class Turned(NamedTuple):
     """An oriented box: a rotation about +y (+z towards +x) and sizes."""
 
@@ -89,6 +99,8 @@ class SceneObject:
     """Oriented box whose axis-aligned bounding box has `size_m`, if known."""
     solids: tuple[Solid | Mesh, ...] = ()
     """Convex bodies whose union is the object, or contains it; none if they are not known."""
+    textured: tuple[Textured, ...] = ()
+    """The surface of `mesh` in parts with materials, for GLBs; none if it has the class colour."""
 
     def __post_init__(self) -> None:
         # Convert to plain floats, because users print them.
@@ -108,9 +120,21 @@ class SceneObject:
                 return Mesh(placed(body.vertices_m), body.faces)
             return Solid(body.kind, *map(_triple, placed(np.array(body[1:])).tolist()))
 
-        mesh = self.mesh and Mesh(placed(self.mesh.vertices_m), self.mesh.faces)
         solids = tuple(map(rescaled, self.solids))
-        return SceneObject(self.label, center, size, mesh, solids=solids)
+        reshaped = self.reshaped(placed)
+        return SceneObject(
+            self.label, center, size, reshaped.mesh, solids=solids, textured=reshaped.textured
+        )
+
+    def reshaped(self, move: Callable[[np.ndarray], np.ndarray]) -> "SceneObject":
+        """Copy of the object in which a function moves the vertices (V, 3) of the mesh and of its
+        textured parts."""
+        mesh = self.mesh and Mesh(move(self.mesh.vertices_m), self.mesh.faces)
+        textured = tuple(
+            part._replace(mesh=Mesh(move(part.mesh.vertices_m), part.mesh.faces))
+            for part in self.textured
+        )
+        return replace(self, mesh=mesh, textured=textured)
 
     def moved(self, offset_m: Sequence[float]) -> "SceneObject":
         """Copy of the object, moved by x, y and z."""
@@ -193,7 +217,7 @@ class Scene:
 
     def without_meshes(self) -> "Scene":
         """Copy of the scene with boxes alone, for methods without meshes."""
-        bare = (replace(item, mesh=None, solids=()) for item in self.objects)
+        bare = (replace(item, mesh=None, solids=(), textured=()) for item in self.objects)
         return replace(self, objects=tuple(bare))
 
     def save(self, path: Path | str) -> None:
@@ -216,10 +240,9 @@ class Scene:
         >>> Scene("empty", "front3d_bedroom").picture().shape
         (360, 480, 3)
         """
-        from sceneprior.render.offscreen import open_renderer
         from sceneprior.render.topdown import perspective
 
-        return perspective(self, open_renderer())
+        return perspective(self)
 
     def show(self) -> None:
         """Display the scene from any line of a notebook's cell; elsewhere an `InputError`."""

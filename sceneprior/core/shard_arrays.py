@@ -4,6 +4,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sceneprior.core.classes import STUFF
+
 if TYPE_CHECKING:
     import h5py
 
@@ -18,7 +20,8 @@ VIEW_ARRAYS: dict[str, tuple[str, tuple[_Side, ...]]] = {
     "sides_clear": ("bool", ("T", "n", 4)),
 }
 """Type and shape of each array of a room; T views, n objects, images of H x W pixels."""
-IMAGES: tuple[_Side, ...] = ("T", "H", "W")
+IMAGES: dict[str, tuple[_Side, ...]] = {"instance_ids": ("T", "H", "W"), "stuff": ("T", "h", "w")}
+"""Shape of each array of images; `stuff` is optional, and h x w its own size."""
 TRUTH_ARRAYS: dict[str, tuple[str, tuple[_Side, ...]]] = {
     "object_class": ("int16", ("m",)),
     "centers_m": ("float32", ("m", 3)),
@@ -67,11 +70,11 @@ def read_arrays(
     return read
 
 
-def checked_images(group: "h5py.Group") -> "h5py.Dataset":
-    images = group["instance_ids"]
+def checked_images(group: "h5py.Group", name: str = "instance_ids") -> "h5py.Dataset":
+    images = group[name]
     if images.dtype not in ("uint8", "uint16") or images.ndim != 3:
-        raise ValueError(f"instance_ids is {images.dtype} {images.shape}, expected uint8 (T, H, W)")
-    _check_size("instance_ids", images)
+        raise ValueError(f"{name} is {images.dtype} {images.shape}, expected uint8 (T, H, W)")
+    _check_size(name, images)
     return images
 
 
@@ -91,3 +94,9 @@ def known_ids(group: "h5py.Group", ids: np.ndarray) -> np.ndarray:
             f"an instance id is {highest}, but it has {objects} objects, and {objects + 1} is void"
         )
     return ids
+
+
+def known_stuff(group: "h5py.Group", stuff: np.ndarray) -> np.ndarray:
+    if (highest := int(stuff.max(initial=0))) >= len(STUFF):
+        raise ValueError(f"stuff is {highest}, expected below {len(STUFF)}")
+    return stuff

@@ -10,7 +10,7 @@ import numpy as np
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import ShardError
 from sceneprior.core.shard_arrays import IMAGES, TRUTH_ARRAYS, VIEW_ARRAYS, shape_of
-from sceneprior.core.shards import FORMAT, VERSION, RoomGroundTruth, RoomViews
+from sceneprior.core.shards import FORMAT, VERSION, RoomGroundTruth, RoomViews, stuff_size
 
 if TYPE_CHECKING:
     import h5py
@@ -45,13 +45,13 @@ def _write_room(group: "h5py.Group", views: RoomViews, truth: RoomGroundTruth | 
     _write_text(group, "sha256", room_checksum(views, truth))
     for name in VIEW_ARRAYS:
         group.create_dataset(name, data=getattr(views, name))
-    ids = _images(views)
     # Level 8 gives half the size of level 4 and takes 1 ms a view; level 9 takes 3 ms for the last
     # 3%. Larger data is slower to read, too.
-    group.create_dataset(
-        "instance_ids", data=ids, chunks=(1, *ids.shape[1:]), compression="gzip",
-        compression_opts=8, shuffle=False,
-    )  # fmt: skip
+    for name, images in _images(views).items():
+        group.create_dataset(
+            name, data=images, chunks=(1, *images.shape[1:]), compression="gzip",
+            compression_opts=8, shuffle=False,
+        )  # fmt: skip
     if truth is not None:
         hidden = group.create_group("ground_truth")
         for name in TRUTH_ARRAYS:
@@ -80,7 +80,7 @@ def room_checksum(views: RoomViews, truth: RoomGroundTruth | None) -> str:
     size = [int(side) for side in views.image_size]
     parts: dict[str, Any] = {"room_id": views.room_id, "image_size": size}
     parts |= {name: getattr(views, name) for name in VIEW_ARRAYS}
-    parts["instance_ids"] = _images(views)
+    parts |= _images(views)
     if truth is not None:
         parts |= {f"ground_truth/{name}": getattr(truth, name) for name in TRUTH_ARRAYS}
         parts |= {"model_ids": truth.model_ids, "height_m": float(truth.height_m)}
@@ -96,12 +96,13 @@ def room_checksum(views: RoomViews, truth: RoomGroundTruth | None) -> str:
     return summary.hexdigest()
 
 
-def _images(views: RoomViews) -> np.ndarray:
+def _images(views: RoomViews) -> dict[str, np.ndarray]:
     if views.instance_ids is None:
         raise ShardError(
             f"Room {views.room_id} was read without its images; read them to write it."
         )
-    return views.instance_ids
+    images = {"instance_ids": views.instance_ids}
+    return images if views.stuff is None else images | {"stuff": views.stuff}
 
 
 def check_views(where: str, views: RoomViews) -> None:
@@ -113,12 +114,15 @@ def check_views(where: str, views: RoomViews) -> None:
     count, objects = views.visible.shape
     height, width = views.image_size
     sizes = {"T": count, "n": objects, "H": height, "W": width}
-    shapes = {name: shape for name, (_, shape) in VIEW_ARRAYS.items()} | {"instance_ids": IMAGES}
+    sizes |= dict(zip("hw", stuff_size(views.image_size), strict=True))
+    shapes = {name: shape for name, (_, shape) in VIEW_ARRAYS.items()} | IMAGES
+    if views.stuff is None:
+        del shapes["stuff"]
     for name, sides in shapes.items():
         came, shape = getattr(getattr(views, name), "shape", None), shape_of(sides, sizes)
         if came != shape:
             raise ShardError(f"{where}: {name} has shape {came}, expected {shape}.")
-    highest = int(_images(views).max(initial=0))
+    highest = int(_images(views)["instance_ids"].max(initial=0))
     if highest > objects + 1:
         raise ShardError(
             f"{where}: an instance id is {highest}, but the room has {objects} objects, and "

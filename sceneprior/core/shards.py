@@ -21,6 +21,7 @@ from sceneprior.core.shard_arrays import (
     VIEW_ARRAYS,
     checked_images,
     known_ids,
+    known_stuff,
     read_arrays,
     shape_of,
 )
@@ -33,9 +34,12 @@ VERSION = 2
 READABLE = (1, VERSION)
 """Versions that can be read; in version 1, void pixels are 0, like the background."""
 INDEX_NAME = "index.json"
-PREPARE = "`sceneprior prep-front`, `prep-scannet` or `prep-posed`"
+PREPARE = "`sceneprior prep-front`, `prep-scannet`, `prep-posed` or `prep-dataset`"
 """Commands that write shards, for messages."""
 MODELS_FOLDER = "models"
+STUFF_SIDE_PX = 240
+"""Approximate longer side of images of stuff. Their outlines are straight, so that many pixels
+measure the same line."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +74,10 @@ class RoomViews(Sightings):
     """(T, 3, 3) float32, in pixels of the H x W image."""
     image_size: tuple[int, int]
     """(H, W)."""
+    stuff: np.ndarray | None = None
+    """(T, h, w) uint8, index into `STUFF`: floor, walls, doors, windows and ceiling, thinned by
+    `stuff_step`; 0 where an object or anything else is, or nothing is known. None if the source
+    does not name them, or if the images were not read."""
 
 
 @dataclass(frozen=True)
@@ -160,11 +168,16 @@ class Shard(contextlib.AbstractContextManager["Shard"]):
             height, width = (int(side) for side in group.attrs["image_size"])
             sizes = {"H": height, "W": width}
             arrays = read_arrays(group, VIEW_ARRAYS, sizes, self._classes)
-            stored = checked_images(group)
-            if stored.shape != (shape := shape_of(IMAGES, sizes)):
-                raise ValueError(f"instance_ids has shape {stored.shape}, expected {shape}")
-            ids = known_ids(group, stored[()]) if images else None
-        return RoomViews(room_id=room_id, instance_ids=ids, image_size=(height, width), **arrays)
+            sizes |= dict(zip("hw", stuff_size((height, width)), strict=True))
+            read: dict[str, Any] = {"stuff": None}
+            for name, check in (("instance_ids", known_ids), ("stuff", known_stuff)):
+                if name == "stuff" and name not in group:
+                    continue
+                stored = checked_images(group, name)
+                if stored.shape != (shape := shape_of(IMAGES[name], sizes)):
+                    raise ValueError(f"{name} has shape {stored.shape}, expected {shape}")
+                read[name] = check(group, stored[()]) if images else None
+        return RoomViews(room_id=room_id, image_size=(height, width), **read, **arrays)
 
     def read_instance_ids(self, room_id: str, views: Sequence[int], step: int = 1) -> np.ndarray:
         """Read instance-id images of some views, downsampled: (views, H/step, W/step)."""
@@ -180,6 +193,11 @@ class Shard(contextlib.AbstractContextManager["Shard"]):
         """Test whether a room has 3D ground truth; the user's posed pictures have none."""
         with self._group(room_id) as group:
             return "ground_truth" in group
+
+    def has_stuff(self, room_id: str) -> bool:
+        """Test whether a room has images of floor, walls and doors."""
+        with self._group(room_id) as group:
+            return "stuff" in group
 
     def read_checksum(self, room_id: str) -> str | None:
         """Read the `room_checksum` stored with a room; None in shards of earlier releases."""
@@ -244,6 +262,26 @@ def thinned(step: int) -> tuple[slice, slice]:
     They take the middle pixel of each block, so that the small image is not shifted.
     """
     return (slice(step // 2, None, step),) * 2
+
+
+def thinned_intrinsics(intrinsics: np.ndarray, step: int) -> np.ndarray:
+    """Intrinsics, (..., 3, 3), in pixels of images that were downsampled by `thinned`."""
+    found = np.array(intrinsics, dtype=np.float64)
+    found[..., :2, 2] += step / 2 - step // 2 - 0.5
+    found[..., :2, :] /= step
+    return found
+
+
+def stuff_step(image_size: tuple[int, int]) -> int:
+    """Step of `thinned` at which stuff is kept: the longer side is then about `STUFF_SIDE_PX`."""
+    return max(1, round(max(image_size) / STUFF_SIDE_PX))
+
+
+def stuff_size(image_size: tuple[int, int]) -> tuple[int, int]:
+    """Size, (h, w), of images of stuff."""
+    step = stuff_step(image_size)
+    height, width = (len(range(step // 2, side, step)) for side in image_size)
+    return height, width
 
 
 def _damaged(path: Path, error: Exception, room_id: str = "") -> ShardError:

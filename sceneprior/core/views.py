@@ -146,6 +146,9 @@ class RoomBoxes(Batch):
     """Look of each object, prototype * 8 + pose (`lifted/prototypes.py`); None if unknown."""
     rectangle_m: Float[Tensor, "rooms 4"] | None = None
     """Rectangle in which each room was furnished: centre x, z and extents x, z; None if unknown."""
+    walls_m: Float[Tensor, "rooms 4"] | None = None
+    """Distances of the walls near the furniture from the origin, outwards, at low z, low x, high z
+    and high x; NaN where no wall is known. None if no wall is."""
 
     def split(self, rooms: int) -> list["RoomBoxes"]:
         """Split into batches of at most `rooms` rooms, without ids."""
@@ -167,6 +170,6 @@ class RoomBoxes(Batch):
             rows = order if tensor.ndim == 2 else order.unsqueeze(-1)
             return torch.take_along_dim(tensor, rows, dim=1)
 
-        # Rectangles have no slots.
-        slots = replace(self, rectangle_m=None).changed(taken)
-        return replace(slots, rectangle_m=self.rectangle_m)
+        # Rectangles and walls have no slots.
+        slots = replace(self, rectangle_m=None, walls_m=None).changed(taken)
+        return replace(slots, rectangle_m=self.rectangle_m, walls_m=self.walls_m)

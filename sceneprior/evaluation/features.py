@@ -27,7 +27,7 @@ from sceneprior.evaluation.networks import (
     inception_features,
     single_threaded,
 )
-from sceneprior.render.offscreen import Renderer
+from sceneprior.render.offscreen import SoftwareRenderer
 from sceneprior.render.topdown import topdown, topdown_protocol
 
 _DRAWN_AT_ONCE = 8
@@ -47,7 +47,6 @@ class Drawing:
     """Settings for drawing and reading pictures, the same for every set of rooms."""
 
     label_set: str
-    renderer: Renderer
     inception: Path | None = None
     """NVIDIA's TorchScript file."""
     small: bool = False
@@ -60,7 +59,7 @@ class Drawing:
             **topdown_protocol(self.label_set).as_dict(),
             "projection": "orthographic, straight down; one flat colour per class; no floor",
             "class_colors": class_colors(len(label_set(self.label_set))).tolist(),
-            "renderer": self.renderer.name,
+            "renderer": SoftwareRenderer.name,
         }
 
     @cached_property
@@ -88,7 +87,7 @@ class Drawing:
         with single_threaded(), ThreadPoolExecutor(processors) as pool:
             while (batch := list(islice(stream, _DRAWN_AT_ONCE))) or waiting:
                 if batch:
-                    images = np.stack([topdown(scene, self.renderer, protocol) for scene in batch])
+                    images = np.stack([topdown(scene, protocol) for scene in batch])
                     waiting.append(pool.submit(self._read, images))
                 # The queue is bounded, so that few pictures are in memory at a time.
                 if not batch or len(waiting) > processors + 1:

@@ -55,7 +55,7 @@ def glb_of(scene: Scene, most_faces: int) -> bytes:
         if item.mesh is not None:
             vertices_m = np.asarray(item.mesh.vertices_m, dtype=np.float64)
             mesh = Mesh(*decimate(vertices_m, np.asarray(item.mesh.faces), most_faces))
-            item = replace(item, mesh=mesh)
+            item = replace(item, mesh=mesh, textured=())
         light.append(item)
     return scene_to_glb(replace(scene, objects=tuple(light)), {"floor": corner_view([scene]).floor})
 

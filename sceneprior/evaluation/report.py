@@ -22,7 +22,6 @@ from sceneprior.evaluation.score_table import (
     relation_rows,
     score_rows,
 )
-from sceneprior.render.offscreen import Renderer
 
 ROOMS_SHOWN = 8
 DECODED_SHOWN = 5
@@ -41,7 +40,6 @@ def write_report(
     generated: Sequence[Scene],
     scores: dict[str, Any],
     commands: Sequence[str],
-    renderer: Renderer,
     views: bool = False,
     curves: dict[str, list[tuple[int, float]]] | None = None,
     decoded: Sequence[tuple[Scene, Scene]] = (),
@@ -82,10 +80,10 @@ def write_report(
         tiles=_tiles(scores),
         views=input_views(shards, rooms=3, views_per_room=2) if views else [],
         curves=curves_svg(curves) if curves else None,
-        decoded=[_pair(*pair, renderer, most_faces) for pair in pairs],
-        generated=[room_pictures(scene, renderer, most_faces) for scene in generated],
-        test=[room_pictures(scene, renderer, most_faces) for scene in test],
-        unfolding=[room_pictures(scene, renderer) for scene in along],
+        decoded=[_pair(*pair, most_faces) for pair in pairs],
+        generated=[room_pictures(scene, most_faces) for scene in generated],
+        test=[room_pictures(scene, most_faces) for scene in test],
+        unfolding=[room_pictures(scene) for scene in along],
         legend=legend(shown),
         headings=headings(scores),
         rows=score_rows(scores),
@@ -104,7 +102,7 @@ def _spread(items: Sequence[_T], count: int) -> list[_T]:
     return [items[row] for row in rows]
 
 
-def _pair(decoded: Scene, truth: Scene, renderer: Renderer, most_faces: int) -> dict[str, Any]:
+def _pair(decoded: Scene, truth: Scene, most_faces: int) -> dict[str, Any]:
     match = match_scenes(decoded, truth)
     accuracy, iou = match.class_accuracy, match.mean_iou
     summary = (
@@ -114,7 +112,7 @@ def _pair(decoded: Scene, truth: Scene, renderer: Renderer, most_faces: int) -> 
     )
     # Both scenes get the true floor, so that both pictures are framed alike.
     rooms = {"decoded": replace(decoded, floor_m=truth.floor_m), "truth": truth}
-    pictures = {name: room_pictures(scene, renderer, most_faces) for name, scene in rooms.items()}
+    pictures = {name: room_pictures(scene, most_faces) for name, scene in rooms.items()}
     return {**pictures, "summary": summary}
 
 

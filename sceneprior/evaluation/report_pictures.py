@@ -15,7 +15,6 @@ from sceneprior.core.palette import quiet_colors
 from sceneprior.core.scene import Scene
 from sceneprior.core.shards import Shard, iterate_rooms
 from sceneprior.evaluation.page import data_uri, glb_of, png_uri
-from sceneprior.render.offscreen import Renderer
 from sceneprior.render.pictures import paint_ids
 from sceneprior.render.topdown import perspective, topdown
 
@@ -38,17 +37,17 @@ class RoomPictures:
     """Data URI of the 3D model that replaces the shaded view; empty if none was requested."""
 
 
-def room_pictures(scene: Scene, renderer: Renderer, most_faces: int = 0) -> RoomPictures:
+def room_pictures(scene: Scene, most_faces: int = 0) -> RoomPictures:
     """Draw a scene's top-down and corner view, and export its 3D model.
 
     `most_faces` limits the faces of each object's mesh; 0 leaves the model out.
     """
     counts = Counter(item.label.replace("_", " ") for item in scene.objects)
     words = [name if many == 1 else f"{name} ×{many}" for name, many in sorted(counts.items())]
-    flat = Image.fromarray(topdown(scene, renderer, outlines=True))
+    flat = Image.fromarray(topdown(scene, outlines=True))
     flat = flat.resize((256, 256), Image.Resampling.BOX)
     solid = io.BytesIO()
-    shaded = Image.fromarray(perspective(scene, renderer, (330, 440)))
+    shaded = Image.fromarray(perspective(scene, (330, 440)))
     shaded.save(solid, format="JPEG", quality=86, optimize=True)
     solid_uri = data_uri("image/jpeg", solid.getvalue())
     glb = data_uri("model/gltf-binary", glb_of(scene, most_faces)) if most_faces else ""

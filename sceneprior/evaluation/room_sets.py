@@ -16,6 +16,7 @@ from sceneprior.core.ground_truth import (
     known_in_3d,
     reference_scenes,
     shuffled_rooms,
+    stream_scenes,
 )
 from sceneprior.core.scene import Scene
 from sceneprior.evaluation.bootstrap import resample_counts
@@ -23,7 +24,6 @@ from sceneprior.evaluation.features import Drawing, Features
 from sceneprior.evaluation.layout_distance import nearest_known
 from sceneprior.evaluation.metric import RoomSet
 from sceneprior.evaluation.metrics.contents import common_label_set
-from sceneprior.evaluation.reference_file import draw_reference
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def choose_rooms(
 
 
 def draw_rooms(
-    rooms: ChosenRooms, shards: Path, drawing: Drawing, boxes: bool, reference: Path | None
+    rooms: ChosenRooms, shards: Path, drawing: Drawing, boxes: bool
 ) -> tuple[dict[str, Features], dict[str, Features]]:
     """Features of every group's pictures (and of `independent_meshes`), with meshes and as boxes.
 
@@ -94,9 +94,13 @@ def draw_rooms(
         def draw(title: str, scenes: Sequence[Scene]) -> Features:
             return drawing.features(scenes, progress(title, len(scenes)))
 
-        splits = {rooms.split: len(groups["test"]), "train": len(rooms.every_train)}
-        drawn = draw_reference(shards, drawing, splits, rooms.train_rows, progress, reference)
-        drawn["test"] = drawn.pop(rooms.split)
+        def draw_real(split: str, rows: Sequence[int]) -> Features:
+            return drawing.features(stream_scenes(shards, split, rows), progress(split, len(rows)))
+
+        drawn = {
+            "test": draw_real(rooms.split, range(len(groups["test"]))),
+            "train": draw_real("train", rooms.train_rows),
+        }
         for group in sorted(set(groups) - set(drawn)):
             drawn[group] = draw(group.replace("_", " "), groups[group])
         # Read again with meshes, so that all training meshes are in memory only for this line.

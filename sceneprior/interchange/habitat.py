@@ -1,6 +1,6 @@
 """Export as a scene dataset of habitat-sim: JSON configs and GLBs; y up, metres."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -71,13 +71,13 @@ def _write_object(
     yaw_rad = 0.0 if item.turned is None else item.turned.yaw_rad + np.pi
     back, center = yaw_rotation(yaw_rad), np.asarray(item.center_m)
 
-    def glb(meshes: Sequence[Mesh]) -> bytes:
-        alone = (Mesh((each.vertices_m - center) @ back, each.faces) for each in meshes)
-        objects = tuple(replace(item, mesh=each, solids=()) for each in alone)
-        return scene_to_glb(replace(scene, objects=objects, extra={}))
+    def glb(objects: Iterable[SceneObject]) -> bytes:
+        alone = tuple(each.reshaped(lambda v: (v - center) @ back) for each in objects)
+        return scene_to_glb(replace(scene, objects=alone, extra={}))
 
-    write_whole(folder / f"{name}.glb", glb([mesh]))
-    write_whole(folder / f"{name}.collider.glb", glb([mesh_of(b) for b in colliders(item)]))
+    bodies = (replace(item, mesh=mesh_of(b), solids=(), textured=()) for b in colliders(item))
+    write_whole(folder / f"{name}.glb", glb([replace(item, mesh=mesh, solids=())]))
+    write_whole(folder / f"{name}.collider.glb", glb(bodies))
     config = _asset(name, f"{name}.collider") | {
         "mass": mass_kg(item), "semantic_id": index, "join_collision_meshes": False,
     }  # fmt: skip

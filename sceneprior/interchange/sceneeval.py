@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sceneprior.core.files import write_json, write_whole
-from sceneprior.core.scene import Mesh, Scene
+from sceneprior.core.scene import Scene
 from sceneprior.core.shell import THICK_M, Shell, shell_of
 from sceneprior.render.scene_files import scene_to_glb
 from sceneprior.render.topdown import node_names, scene_meshes
@@ -33,8 +34,9 @@ def write_sceneeval(scenes: Sequence[Scene], folder: Path) -> None:
         names, meshes = node_names(scene), scene_meshes(scene)
         for name, item, mesh in zip(names, scene.objects, meshes, strict=True):
             model = f"{scene.name}_{name}"
-            around = Mesh(mesh.vertices_m - np.asarray(item.center_m), mesh.faces)
-            alone = replace(scene, objects=(replace(item, mesh=around, solids=()),))
+            whole = replace(item, mesh=mesh, solids=())
+            around = whole.reshaped(partial(np.add, -np.asarray(item.center_m)))
+            alone = replace(scene, objects=(around,))
             write_whole(folder / "assets" / model / f"{model}.glb", scene_to_glb(alone))
             annotations = {"category": item.label, "description": item.label, "materials": []}
             write_json(folder / "assets" / model / "data.json", {"annotations": annotations})

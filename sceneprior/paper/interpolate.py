@@ -18,7 +18,6 @@ from sceneprior.core.scene import Scene
 from sceneprior.paper.decode import DecodedRoom, decode_rooms
 from sceneprior.paper.sampling import Point, latent_of
 from sceneprior.paper.trained import TrainedPrior
-from sceneprior.render.offscreen import Renderer
 from sceneprior.render.pictures import contact_sheet, gif_bytes, png_bytes
 from sceneprior.render.topdown import corner_view, perspective
 
@@ -99,17 +98,13 @@ def animation(pictures: Sequence[UInt8[np.ndarray, "height width 3"]]) -> bytes:
     return gif_bytes(there_and_back, times + times[-2:0:-1])
 
 
-def write_pictures(
-    trained: TrainedPrior, scenes: Sequence[Scene], folder: Path, renderer: Renderer
-) -> None:
+def write_pictures(trained: TrainedPrior, scenes: Sequence[Scene], folder: Path) -> None:
     """Write `strip.png`, which shows `scenes` (the rooms of `interpolate`), and `animation.gif`,
     which has `BETWEEN` pictures per step."""
     start, end = (latent_of(trained, scene) for scene in (scenes[0], scenes[-1]))
     z = path_latents(trained, start, end, (len(scenes) - 1) * BETWEEN + 1)
     rooms = decode_rooms(trained, z, [""] * len(z))
     view = corner_view([room.scene for room in rooms], TILE)
-    pictures = [
-        perspective(room.scene, renderer, view=view, colors=mixed_colors(room)) for room in rooms
-    ]
+    pictures = [perspective(room.scene, view=view, colors=mixed_colors(room)) for room in rooms]
     write_whole(folder / "strip.png", png_bytes(strip(pictures[::BETWEEN])))
     write_whole(folder / "animation.gif", animation(pictures))

@@ -8,7 +8,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from sceneprior.core.scene import Scene
-from sceneprior.render.offscreen import Orthographic, Renderer
+from sceneprior.render.offscreen import Orthographic, SoftwareRenderer
 from sceneprior.render.pictures import paint_ids
 from sceneprior.render.topdown import BACKGROUND, FLOOR_COLOR, object_colors, scene_meshes
 
@@ -21,7 +21,7 @@ WALL, DOOR, WINDOW = (90, 86, 80), (176, 120, 60), (90, 160, 215)
 """Colours of the floor's outline and of openings in it."""
 
 
-def floor_plan(scene: Scene, renderer: Renderer) -> UInt8[np.ndarray, "512 662 3"]:
+def floor_plan(scene: Scene) -> UInt8[np.ndarray, "512 662 3"]:
     """The room from straight above, wholly in the picture whatever its size; +x is right, +z down.
 
     Objects have flat class colours and dark borders, and the highest surface hides what is below
@@ -36,7 +36,7 @@ def floor_plan(scene: Scene, renderer: Renderer) -> UInt8[np.ndarray, "512 662 3
         height_m = max(float(mesh.vertices_m[:, 1].max()) for mesh in meshes) + 1
         x, z = center
         camera = np.array([[1.0, 0, 0, -x], [0, 0, 1, -z], [0, -1, 0, height_m], [0, 0, 0, 1]])
-        ids = renderer.instance_ids(meshes, Orthographic(camera, 1 / scale), ids.shape)
+        ids = SoftwareRenderer().instance_ids(meshes, Orthographic(camera, 1 / scale), ids.shape)
     plan = Image.new("RGB", (PLAN_PX, PLAN_PX), BACKGROUND)
     draw = ImageDraw.Draw(plan)
 

@@ -14,11 +14,11 @@ import numpy as np
 
 from sceneprior.core.errors import InputError, InputWarning
 from sceneprior.core.files import is_name, read_json, write_json, write_whole
-from sceneprior.core.scene import Mesh, Scene, mesh_of_file
+from sceneprior.core.scene import Mesh, Scene, Textured
 from sceneprior.core.scene_json import FORMAT, read_scene, scene_to_json
 from sceneprior.core.shell import ShellName, is_shell, shell_meshes
 from sceneprior.render.floor_plans import floor_plan
-from sceneprior.render.offscreen import Renderer, open_renderer
+from sceneprior.render.model_files import joined, load_parts
 from sceneprior.render.pictures import png_bytes
 from sceneprior.render.scene_usd import scene_to_usd
 from sceneprior.render.topdown import (
@@ -34,18 +34,16 @@ PACKAGE_FORMATS = "sceneprior-"
 """Prefix of the names of the package's formats."""
 
 
-def save_scene(
-    scene: Scene, path: Path, renderer: Renderer | None = None, shell: ShellName = "none"
-) -> None:
+def save_scene(scene: Scene, path: Path, shell: ShellName = "none") -> None:
     """Write a scene to one file, atomically, in the format of its suffix.
 
     `.json`: classes and boxes. `.glb`: one node per object, called `<index>_<class>`, in the class
-    colour; an object without a mesh is written as its box. `.obj`: the same objects, with an `.mtl`
-    file. `.usda`: one mesh per object, its class in `userProperties:class`. `.png`: a floor plan
+    colour or with the materials of its CAD model, in children `<index>_<class>/<number>`; an object
+    without a mesh is written as its box. `.obj`: the objects in class colours, with an `.mtl` file.
+    `.usda`: one mesh per object, its class in `userProperties:class`. `.png`: a floor plan
     of the whole room. 3D formats keep the axes and the unit of the room frame: y up, metres.
 
     Args:
-        renderer: Renderer of the picture; None opens one.
         shell: With `walls`, models have nodes `floor`, `wall_0` and so on, and `ceiling`; with
             `floor`, the first alone.
 
@@ -66,7 +64,7 @@ def save_scene(
         case ".usda":
             write_whole(path, scene_to_usd(scene, shell_meshes(scene, shell)))
         case ".png":
-            write_whole(path, png_bytes(floor_plan(scene, renderer or open_renderer())))
+            write_whole(path, png_bytes(floor_plan(scene)))
         case suffix:
             raise InputError(
                 f"{path} ends with '{suffix}', which is not a scene format; end it with one of "
@@ -75,7 +73,8 @@ def save_scene(
 
 
 def scene_to_glb(scene: Scene, shell: Mapping[str, Mesh] = NO_SHELL) -> bytes:
-    """The scene as binary glTF 2.0: a named node, mesh and material per object; no cameras.
+    """The scene as binary glTF 2.0: a named node, mesh and material per object, or a node with a
+    child per material if the object is textured; no cameras.
 
     The `extras` of its glTF scene have the entry `sceneprior`; see `glb_extras`.
 
@@ -117,9 +116,10 @@ def scene_to_obj(
 
     if not scene.objects and not shell:
         return "", b""
+    plain = tuple(replace(item, textured=()) for item in scene.objects)
     text, files = export_obj(
-        _trimesh_of(scene, shell), include_normals=False, return_texture=True, mtl_name=materials,
-        header=None,
+        _trimesh_of(replace(scene, objects=plain), shell), include_normals=False,
+        return_texture=True, mtl_name=materials, header=None,
     )  # fmt: skip
     return text + "\n", files[materials]
 
@@ -132,19 +132,26 @@ def _trimesh_of(scene: Scene, shell: Mapping[str, Mesh]) -> Any:
     for node, item, mesh, color in zip(
         node_names(scene), scene.objects, meshes, colors, strict=True
     ):
-        _add(room, node, item.label, mesh, color)
+        if not item.textured:
+            _add(room, node, item.label, Textured(mesh), color)
+            continue
+        room.graph.update(frame_from=room.graph.base_frame, frame_to=node)
+        for number, part in enumerate(item.textured):
+            _add(room, f"{node}/{number}", item.label, part, color, node)
     for node, mesh in shell.items():
-        _add(room, node, node.partition("_")[0], mesh, shell_color(node))
+        _add(room, node, node.partition("_")[0], Textured(mesh), shell_color(node))
     return room
 
 
-def _add(room: Any, node: str, material: str, mesh: Mesh, color: np.ndarray) -> None:
+def _add(
+    room: Any, node: str, label: str, part: Textured, color: np.ndarray, parent: str | None = None
+) -> None:
     import trimesh
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
 
-    surface = PBRMaterial(
-        name=material,
+    surface = part.material or PBRMaterial(
+        name=label,
         baseColorFactor=linear_rgba(color),
         metallicFactor=0.0,
         roughnessFactor=0.9,
@@ -152,12 +159,12 @@ def _add(room: Any, node: str, material: str, mesh: Mesh, color: np.ndarray) -> 
         doubleSided=True,
     )
     geometry = trimesh.Trimesh(
-        np.asarray(mesh.vertices_m, dtype=np.float64),
-        np.asarray(mesh.faces, dtype=np.int64),
+        np.asarray(part.mesh.vertices_m, dtype=np.float64),
+        np.asarray(part.mesh.faces, dtype=np.int64),
         process=False,
-        visual=TextureVisuals(material=surface),
+        visual=TextureVisuals(uv=part.uv, material=surface),
     )
-    room.add_geometry(geometry, node_name=node, geom_name=node)
+    room.add_geometry(geometry, node_name=node, geom_name=node, parent_node_name=parent)
 
 
 def _empty_glb(extras: dict[str, Any]) -> bytes:
@@ -169,36 +176,31 @@ def _empty_glb(extras: dict[str, Any]) -> bytes:
     return header.tobytes() + text
 
 
-def read_glb_meshes(path: Path) -> dict[str, Mesh]:
-    """Meshes of a GLB by node name, without the room's shell; vertices in the room frame."""
+def read_glb_parts(path: Path, with_materials: bool = False) -> dict[str, list[Textured]]:
+    """The parts of each object of a GLB by the name of its node, without the room's shell; vertices
+    in the room frame."""
+    objects: dict[str, list[Textured]] = {}
     try:
-        return {node: mesh for node, mesh in glb_meshes(path).items() if not is_shell(node)}
+        for node, part in load_parts(path, "glb", with_materials).items():
+            name, child, _ = node.partition("/")
+            if not is_shell(node):
+                # A node without children has the colour of its class.
+                objects.setdefault(name, []).append(part if child else Textured(part.mesh))
     except Exception as error:  # a damaged file raises almost anything in trimesh
         reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
         raise InputError(
             f"{path} cannot be read as a GLB ({reason.rstrip('.')}); write the scene again with "
             "`sceneprior synthesize`, or delete the file to use the boxes alone."
         ) from None
+    return objects
 
 
-def glb_meshes(path: Path) -> dict[str, Mesh]:
-    """Meshes of a GLB by node name, placed by their nodes; a damaged file raises any exception."""
-    import trimesh
-
-    # process=False keeps vertices and faces as written. Materials depend on the class alone.
-    loaded = trimesh.load_scene(Path(path), file_type="glb", process=False, skip_materials=True)
-    meshes = {}
-    for node in loaded.graph.nodes_geometry:
-        transform, name = loaded.graph[node]
-        mesh = loaded.geometry[name]
-        vertices = np.asarray(mesh.vertices, dtype=np.float64)
-        placed = vertices @ transform[:3, :3].T + transform[:3, 3]
-        meshes[node] = mesh_of_file(placed, mesh.faces)
-    return meshes
-
-
-def load_scene(path: Path) -> Scene:
+def load_scene(path: Path, with_materials: bool = False) -> Scene:
     """Read a scene's JSON, and its meshes from the GLB of the same name if there is one.
+
+    Args:
+        with_materials: Also read the materials of CAD models (`SceneObject.textured`), which take
+            much more memory than their meshes.
 
     Raises:
         InputError: the JSON is not a scene, or the GLB has other objects.
@@ -208,22 +210,28 @@ def load_scene(path: Path) -> Scene:
     glb = path.with_suffix(".glb")
     if not glb.is_file() or not scene.objects:
         return scene
-    meshes = read_glb_meshes(glb)
+    parts = read_glb_parts(glb, with_materials)
     wanted = node_names(scene)
-    if set(meshes) != set(wanted):
-        unlisted = sorted(set(meshes) ^ set(wanted))
+    if set(parts) != set(wanted):
+        unlisted = sorted(set(parts) ^ set(wanted))
         raise InputError(
             f"{glb.name} and {path.name} describe different objects (only in one of them: "
             f"{', '.join(unlisted[:4])}); write both again with `sceneprior synthesize`."
         )
     with_mesh = [
-        replace(item, mesh=meshes[node]) for node, item in zip(wanted, scene.objects, strict=True)
+        replace(
+            item,
+            mesh=parts[node][0].mesh if len(parts[node]) == 1 else joined(parts[node]),
+            textured=tuple(each for each in parts[node] if each.material is not None),
+        )
+        for node, item in zip(wanted, scene.objects, strict=True)
     ]
     return replace(scene, objects=tuple(with_mesh))
 
 
-def load_scene_folder(folder: Path) -> list[Scene]:
-    """Read all scenes of a folder, sorted by name in natural order (room_2 before room_10).
+def load_scene_folder(folder: Path, with_materials: bool = False) -> list[Scene]:
+    """Read all scenes of a folder, sorted by name in natural order (room_2 before room_10), each as
+    `load_scene` does.
 
     JSON files of the package's other formats, such as scores, are skipped; JSON files of unknown
     formats are skipped with a warning.
@@ -235,7 +243,9 @@ def load_scene_folder(folder: Path) -> list[Scene]:
     paths = sorted(folder.glob("*.json"), key=_counting_order)
     # Unreadable files (format None) are not skipped, so that load_scene reports their error.
     formats = {path: format_of(path) for path in paths}
-    scenes = [load_scene(path) for path, form in formats.items() if form in (FORMAT, None)]
+    scenes = [
+        load_scene(path, with_materials) for path, form in formats.items() if form in (FORMAT, None)
+    ]
     if not scenes:
         _refuse_box_lists(folder, [*folder.rglob("*.npz"), *paths])
         raise InputError(

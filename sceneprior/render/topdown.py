@@ -1,4 +1,4 @@
-"""Pictures of scenes: from straight above (for metrics), from above a corner, and turntables."""
+"""Pictures of scenes: from straight above (for metrics), and from above a corner."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -12,7 +12,7 @@ from sceneprior.core.geometry.corners import BOX_FACES, box_corners
 from sceneprior.core.palette import quiet_colors
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.core.shell import rectangle, shell_of, slab
-from sceneprior.render.offscreen import Orthographic, Pinhole, Renderer
+from sceneprior.render.offscreen import Orthographic, Pinhole, SoftwareRenderer
 from sceneprior.render.pictures import paint_ids
 
 BACKGROUND = (255, 255, 255)
@@ -96,7 +96,6 @@ def linear_rgba(color: UInt8[np.ndarray, "3"]) -> list[float]:
 
 def topdown(
     scene: Scene,
-    renderer: Renderer,
     protocol: TopDownProtocol | None = None,
     outlines: bool = False,
 ) -> UInt8[np.ndarray, "height width 3"]:
@@ -116,7 +115,7 @@ def topdown(
         height = protocol.camera_height_m
         world_to_camera = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, height], [0, 0, 0, 1]])
         camera = Orthographic(world_to_camera, protocol.metres_per_pixel)
-        ids = renderer.instance_ids(scene_meshes(scene), camera, protocol.image_size)
+        ids = SoftwareRenderer().instance_ids(scene_meshes(scene), camera, protocol.image_size)
     if outlines:
         return paint_ids(ids, object_colors(scene), protocol.background)
     colors = class_colors(len(label_set(scene.label_set)))[scene.class_indices]
@@ -200,7 +199,6 @@ def _fitted(
 
 def perspective(
     scene: Scene,
-    renderer: Renderer,
     image_size: tuple[int, int] = (360, 480),
     view: CornerView | None = None,
     colors: UInt8[np.ndarray, "objects 3"] | None = None,
@@ -217,36 +215,6 @@ def perspective(
     meshes = [*scene_meshes(scene), view.floor, *view.walls]
     # Walls cast no shadows: they would darken the whole room.
     shadowed = len(meshes) - len(walls)
-    return renderer.shaded(meshes, colors, view.camera, view.image_size, BACKGROUND, shadowed)
-
-
-def turntable(
-    scene: Scene,
-    renderer: Renderer,
-    count: int = 36,
-    image_size: tuple[int, int] = (240, 320),
-) -> list[UInt8[np.ndarray, "height width 3"]]:
-    """Shaded pictures from `count` directions around a room, all at the same scale.
-
-    The first has the viewing direction of `perspective`.
-    """
-    floor = corner_view([scene]).floor
-    points = np.concatenate([mesh.vertices_m for mesh in [*scene_meshes(scene), floor]])
-    target, diagonal = (points.min(0) + points.max(0)) / 2, np.linalg.norm(np.ptp(points, axis=0))
-    poses, reach = [], np.zeros(2)
-    for angle in np.arange(count) * 2 * np.pi / count:
-        turned = np.array(
-            [
-                np.cos(angle) * DIRECTION[0] + np.sin(angle) * DIRECTION[2],
-                DIRECTION[1],
-                np.cos(angle) * DIRECTION[2] - np.sin(angle) * DIRECTION[0],
-            ]
-        )
-        poses.append(look_at(target + 2 * diagonal * turned, target))
-        x, y, z = poses[-1][:3, :3] @ points.T + poses[-1][:3, 3:]
-        reach = np.maximum(reach, np.abs([x / z, y / z]).max(axis=1))
-    height, width = image_size
-    focal = 0.96 * min(width / 2 / reach[0], height / 2 / reach[1])
-    intrinsics = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    views = [CornerView(Pinhole(pose, intrinsics), image_size, floor) for pose in poses]
-    return [perspective(scene, renderer, view=view) for view in views]
+    return SoftwareRenderer().shaded(
+        meshes, colors, view.camera, view.image_size, BACKGROUND, shadowed
+    )

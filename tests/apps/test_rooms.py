@@ -21,39 +21,37 @@ def scene() -> Scene:
     return Scene("room", "front3d_bedroom", (bed,), extra={"seed": 3})
 
 
-def test_new_scenes_leave_none_of_the_old_ones_behind_and_everything_else_alone(
-    scene, renderer, tmp_path
-):
+def test_new_scenes_leave_none_of_the_old_ones_behind_and_everything_else_alone(scene, tmp_path):
     rooms = [replace(scene, name=name) for name in "abc"]
-    write_scenes(rooms, tmp_path, renderer)
+    write_scenes(rooms, tmp_path)
     (tmp_path / "latents.npz").write_bytes(b"of the old rooms")
     (tmp_path / "scores.json").write_text('{"format": "sceneprior-scores"}')
     (tmp_path / "notes.txt").write_text("mine")
     (tmp_path / "c.glb.0123abcd.part").write_bytes(b"of a process that was killed")
     (tmp_path / "film.part").write_bytes(b"mine, too")
-    write_scenes(rooms[1:2], tmp_path, renderer)
+    write_scenes(rooms[1:2], tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {
         "b.json", "b.glb", "b.png", "overview.png", "scores.json", "notes.txt", "film.part",
     }  # fmt: skip
 
 
-def test_a_failed_write_leaves_nothing_under_the_final_name(scene, tmp_path, renderer, monkeypatch):
+def test_a_failed_write_leaves_nothing_under_the_final_name(scene, tmp_path, monkeypatch):
     def torn(picture, file, **_):
         file.write(b"half of a PNG")
         raise OSError("No space left on device")
 
     monkeypatch.setattr(Image.Image, "save", torn)
     with pytest.raises(OSError, match="No space left"):
-        write_scene(scene, tmp_path, "room", renderer)
+        write_scene(scene, tmp_path, "room")
     # The GLB was whole; without the JSON, which comes last, nobody takes it for a scene.
     assert [path.name for path in tmp_path.iterdir()] == ["room.glb"]
 
 
-def test_an_overview_holds_each_room_in_its_place(renderer):
+def test_an_overview_holds_each_room_in_its_place():
     empty = Scene("empty", "front3d_bedroom")
     bed = SceneObject("double_bed", (0.0, 0.5, 0.0), (2.0, 1.0, 2.0))
     height, width = OVERVIEW_TILE
-    sheet = overview([empty] * 4 + [Scene("bed", "front3d_bedroom", (bed,))], renderer)
+    sheet = overview([empty] * 4 + [Scene("bed", "front3d_bedroom", (bed,))])
     assert sheet.shape == (2 * height, 4 * width, 3)
     tiles = sheet.reshape(2, height, 4, width, 3).swapaxes(1, 2).reshape(8, -1, 3)
     colourful = (np.ptp(tiles.astype(int), axis=-1) > 25).sum(axis=1)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from toy_rooms import write_shard
 
+from sceneprior.core.classes import STUFF
 from sceneprior.core.errors import ShardError
 from sceneprior.core.shard_writing import check_views, room_checksum
 from sceneprior.core.shards import (
@@ -16,6 +17,10 @@ from sceneprior.core.shards import (
     iterate_rooms,
     list_shards,
     read_index,
+    stuff_size,
+    stuff_step,
+    thinned,
+    thinned_intrinsics,
 )
 
 
@@ -34,6 +39,12 @@ def make_room(room_id="house_A", views=3, objects=2, size=(12, 16), seed=0):
         instance_ids=rng.integers(0, objects + 1, (views, *size)).astype(np.uint8),
         image_size=size,
     )
+
+
+def with_stuff(room, seed=0):
+    shape = (len(room.visible), *stuff_size(room.image_size))
+    stuff = np.random.default_rng(seed).integers(0, len(STUFF), shape).astype(np.uint8)
+    return replace(room, stuff=stuff)
 
 
 def make_truth(objects=3, seed=0):
@@ -75,6 +86,50 @@ def test_round_trip(tmp_path):
         with pytest.raises(ShardError, match="room h_2 carries no 3D ground truth"):
             shard.read_ground_truth("h_2")
     assert {room_id for _, room_id in iterate_rooms(tmp_path, "train")} == {"h/1", "h_2"}
+
+
+def test_stuff_is_optional_and_read_with_the_images(tmp_path):
+    rooms = [make_room("a"), with_stuff(make_room("b", 5, 3, (600, 900)))]
+    assert rooms[1].stuff.shape == (5, 150, 225)
+    write_shard(tmp_path / "a.h5", "front3d_bedroom", [(room, None) for room in rooms])
+    with Shard(tmp_path / "a.h5") as shard:
+        assert [shard.has_stuff(name) for name in "ab"] == [False, True]
+        for room in rooms:
+            read = shard.read_room(room.room_id, images=True)
+            assert_same(read, room)
+            assert shard.read_room(room.room_id).stuff is None
+            assert shard.read_checksum(room.room_id) == room_checksum(read, None)
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (np.full((3, 12, 16), 6, np.uint8), "stuff is 6, expected below 6"),
+        (np.zeros((3, 6, 16), np.uint8), r"stuff has shape \(3, 6, 16\), expected \(3, 12, 16\)"),
+        (np.zeros((3, 12, 16), np.float32), "stuff is float32"),
+    ],
+)
+def test_damaged_stuff_is_one_sentence(tmp_path, value, message):
+    write_shard(tmp_path / "a.h5", "front3d_bedroom", [(with_stuff(make_room()), None)])
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        del file["rooms/house_A/stuff"]
+        file["rooms/house_A"].create_dataset("stuff", data=value)
+    with Shard(tmp_path / "a.h5") as shard, pytest.raises(ShardError, match=message):
+        shard.read_room("house_A", images=True)
+
+
+@pytest.mark.parametrize("size", [(12, 16), (360, 480), (361, 479), (968, 1296), (324, 250)])
+def test_thinned_pixels_are_where_their_intrinsics_say(size):
+    step = stuff_step(size)
+    rows, columns = (part[thinned(step)] for part in np.indices(size))
+    assert rows.shape == stuff_size(size)
+    assert step == 1 or 160 <= max(rows.shape) <= 320
+    K = np.array([[100.0, 0, 7], [0, 90, 5], [0, 0, 1]])
+    small = thinned_intrinsics(K, step)
+    for row, column in ((0, 0), (rows.shape[0] - 1, 2)):
+        pixel = np.array([columns[row, column] + 0.5, rows[row, column] + 0.5, 1])
+        ray = np.linalg.solve(K, pixel)
+        np.testing.assert_allclose(small @ ray, [column + 0.5, row + 0.5, 1], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -128,6 +183,7 @@ def test_shards_of_version_1_are_read_and_those_of_the_future_are_not(tmp_path):
             r"instance id is 4, but the room has 2 objects, and 3 is void\.",
         ),
         ("instance_ids", None, "instance_ids has shape None"),
+        ("stuff", np.zeros((3, 6, 8), np.uint8), r"stuff has shape \(3, 6, 8\), expected \(3, 12"),
     ],
 )
 def test_rooms_that_disagree_with_themselves_are_refused(name, value, message):
@@ -197,7 +253,7 @@ def test_folders(tmp_path):
 
 
 def test_a_checksum_covers_everything_and_survives_the_file(tmp_path):
-    room, truth = make_room(), make_truth()
+    room, truth = with_stuff(make_room()), make_truth()
     write_shard(tmp_path / "a.h5", "front3d_bedroom", [(room, truth), (make_room("bare"), None)])
     with Shard(tmp_path / "a.h5") as shard:
         assert shard.has_ground_truth("house_A") and not shard.has_ground_truth("bare")

@@ -1,4 +1,4 @@
-"""A folder of toy shards with 3D ground truth, and the renderer every machine has."""
+"""A folder of toy shards with 3D ground truth."""
 
 from collections.abc import Callable
 from pathlib import Path

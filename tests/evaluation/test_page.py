@@ -44,10 +44,10 @@ def bedroom(name: str = "mine") -> Scene:
 
 
 @pytest.fixture(scope="module")
-def page(renderer, tmp_path_factory) -> Path:
+def page(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("page") / "rooms.html"
     rooms = [bedroom(), replace(bedroom("<other>"), objects=())]
-    write_rooms_page(path, rooms, renderer, title="Rooms & more", subtitle="made by hand")
+    write_rooms_page(path, rooms, title="Rooms & more", subtitle="made by hand")
     return path
 
 
@@ -132,11 +132,11 @@ def test_rooms_share_the_faces_of_a_page():
     assert len(whole) - len(light) == pytest.approx((faces - 300) * 18, rel=0.05)
 
 
-def test_boxes_are_drawn_whole(renderer, tmp_path):
+def test_boxes_are_drawn_whole(tmp_path):
     """A mesh of 12 triangles is never decimated, however many rooms a page shows."""
     rooms = [bedroom().without_meshes()] * (ROOMS_SHOWN + 1)
     assert len(BOX_FACES) < faces_per_object(rooms)
-    write_rooms_page(tmp_path / "a.html", rooms, renderer, title="Boxes", subtitle="")
+    write_rooms_page(tmp_path / "a.html", rooms, title="Boxes", subtitle="")
     assert (tmp_path / "a.html").read_text().count("<model-viewer ") == ROOMS_SHOWN
 
 

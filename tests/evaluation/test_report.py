@@ -26,10 +26,10 @@ def generated(shards) -> list[Scene]:
 
 
 @pytest.fixture(scope="module")
-def page(shards, renderer, generated, tmp_path_factory) -> str:
+def page(shards, generated, tmp_path_factory) -> str:
     path = tmp_path_factory.mktemp("report") / "new" / "report.html"
     truth = reference_scenes(shards, "train", limit=2, tracked_only=True)
-    scores = evaluate_synthesis(generated, shards, EvalOptions(renderer=renderer))
+    scores = evaluate_synthesis(generated, shards, EvalOptions())
     scores |= {"class_accuracy": 0.991, "box_iou_3d": 0.74, "seconds": 600.0}
     write_report(
         path,
@@ -44,7 +44,6 @@ def page(shards, renderer, generated, tmp_path_factory) -> str:
         curves={"layout/box": [(step, 1 / (1 + step)) for step in range(1000)], "nothing": []},
         decoded=[(generated[0], truth[0]), (generated[1], truth[1])],
         unfolding=generated,
-        renderer=renderer,
     )
     assert [item.name for item in path.parent.iterdir()] == ["report.html"]
     assert path.stat().st_size < 8e6
@@ -105,11 +104,11 @@ def test_every_part_is_there(page):
     assert "100% of 2 classes right, mean 3D box IoU 1.00" in page
 
 
-def test_parts_without_material_are_left_out(shards, renderer, tmp_path):
+def test_parts_without_material_are_left_out(shards, tmp_path):
     write_report(
         tmp_path / "a.html", title="Bare", shards=shards, source="run", made_by="none",
         views=True, generated=[], scores={}, commands=[], curves={}, decoded=[], unfolding=[],
-        renderer=renderer,
+        
     )  # fmt: skip
     page = (tmp_path / "a.html").read_text()
     assert re.findall("<h2>(.*)</h2>", page) == ["Training input"]
@@ -136,21 +135,21 @@ def test_input_views_show_masks_in_class_colours_inside_their_boxes(shards):
     np.testing.assert_allclose(image[30, 9], (244, 245, 247), atol=4)
 
 
-def test_room_pictures_count_in_words(renderer):
+def test_room_pictures_count_in_words():
     stool = SceneObject("stool", (0.0, 0.2, 0.0), (0.4, 0.4, 0.4))
     bed = SceneObject("double_bed", (1.0, 0.3, 1.0), (1.8, 0.6, 2.0))
     room = Scene("a", "front3d_bedroom", (stool, bed, stool))
-    assert room_pictures(room, renderer).contents == "double bed, stool ×2"
-    assert room_pictures(replace(room, objects=()), renderer).contents == "nothing"
+    assert room_pictures(room).contents == "double bed, stool ×2"
+    assert room_pictures(replace(room, objects=())).contents == "nothing"
     assert [name for name, _ in legend([room])] == ["double bed", "stool"]
     assert legend([room])[0][1] == "#" + bytes(quiet_colors(["double_bed"])[0].tolist()).hex()
 
 
-def test_a_page_of_a_stranger_s_rooms_runs_nothing(renderer, tmp_path):
+def test_a_page_of_a_stranger_s_rooms_runs_nothing(tmp_path):
     label = "<img src=x onerror='alert(1)'>"
     item = SceneObject(label, (0.0, 0.5, 0.0), (1.0, 1.0, 1.0))
     room = Scene("</figcaption><script>alert(2)</script>", f"void,{label}", (item,))
-    write_rooms_page(tmp_path / "a.html", [room], renderer, title=label, subtitle=label)
+    write_rooms_page(tmp_path / "a.html", [room], title=label, subtitle=label)
     page = (tmp_path / "a.html").read_text("utf-8")
     assert "<img src=x" not in page and "<script>alert" not in page
     assert "&lt;script&gt;alert(2)" in page and 'alt="&lt;img src=x onerror=&#39;' in page

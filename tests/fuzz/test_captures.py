@@ -12,6 +12,7 @@ import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import capture_files as tools
 import numpy as np
 import psutil
 import pytest
@@ -27,7 +28,6 @@ from data_prep.front.models import ModelBank
 from data_prep.front.recipe import load_recipe
 from data_prep.front.rooms import read_house
 from data_prep.posed.source import PosedSource
-from data_prep.posed.transforms import read_recording
 from data_prep.posed.views import PosedSettings, prepare_posed
 from data_prep.scannet.labels import read_labels
 from data_prep.scannet.scans import ScanSettings, read_scan
@@ -122,9 +122,10 @@ def room(tmp_path):
 
     def read():
         source = PosedSource(tmp_path / "rooms", LABELS)
+        source.found()
         source.assumptions()
         source.settings(None)
-        prepare_posed(read_recording(made.folder), LABELS, PosedSettings())
+        prepare_posed(*source.open(made.folder), PosedSettings())
 
     read()
     return made, read
@@ -195,6 +196,39 @@ def test_coco_json(tmp_path):
     check_all(lambda rng: path.write_text(damaged_json(data, rng)), lambda: read_coco(path))
     data["annotations"] = rows
     check_all(lambda rng: path.write_text(damaged_json(data, rng)), lambda: read_coco(path))
+
+
+JSONS = {
+    "polycam": (tools.write_polycam, f"keyframes/corrected_cameras/{tools.timestamp(1)}.json"),
+    "record3d": (lambda room: tools.write_record3d(room, per_frame=True), "metadata"),
+    "grounded-sam2": (tools.write_grounded_sam2, "json_data/mask_frame_00001.json"),
+    "grounded-sam2 images": (tools.write_grounded_sam2_images, "json_data/results_1.json"),
+    "coco images": (tools.write_coco_images, "coco.json"),
+    "coco tracks": (lambda room: tools.write_coco_images(room, "track_id"), "coco.json"),
+    "coco video": (tools.write_coco_video, "instances.json"),
+}
+MASKS = {
+    "sam2": (tools.write_sam2, "003/frame_00001.png"),
+    "grounded-sam2": (tools.write_grounded_sam2, "mask_data/mask_frame_00001.npy"),
+}
+
+
+@pytest.mark.parametrize("tool", JSONS)
+def test_jsons_of_other_tools(room, tool):
+    made, read = room
+    write, name = JSONS[tool]
+    write(made)
+    data = json.loads((made.folder / name).read_text())
+    check_all(lambda rng: (made.folder / name).write_text(damaged_json(data, rng)), read)
+
+
+@pytest.mark.parametrize("tool", MASKS)
+def test_masks_of_other_tools(room, tool):
+    made, read = room
+    write, name = MASKS[tool]
+    write(made)
+    data = (made.folder / name).read_bytes()
+    check_all(lambda rng: (made.folder / name).write_bytes(damaged_bytes(data, rng, 200)), read)
 
 
 @pytest.fixture

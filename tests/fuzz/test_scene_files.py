@@ -41,13 +41,12 @@ def example() -> Any:
 def use_scenes(scenes: list, folder: Path) -> None:
     """Draw and write what could be read, in each format."""
     from sceneprior.interchange.export import export_scenes
-    from sceneprior.render.offscreen import SoftwareRenderer
     from sceneprior.render.scene_files import load_scene, save_scene
     from sceneprior.render.topdown import TopDownProtocol, perspective, topdown
 
     for scene in scenes:
-        topdown(scene, SoftwareRenderer(), TopDownProtocol((32, 32)))
-        perspective(scene, SoftwareRenderer(), (24, 32))
+        topdown(scene, TopDownProtocol((32, 32)))
+        perspective(scene, (24, 32))
         for ending in (".json", ".glb", ".obj"):
             save_scene(scene, folder / f"again{ending}")
         load_scene(folder / "again.json")

@@ -9,7 +9,6 @@ from sceneprior.apps.rooms import write_scenes
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene
 from sceneprior.interchange.box_lists import read_box_lists, read_boxes, turned_box
-from sceneprior.render.offscreen import SoftwareRenderer
 from sceneprior.render.scene_files import load_scene_folder
 from sceneprior.render.topdown import topdown
 
@@ -65,7 +64,7 @@ def test_half_extents_turn_into_boxes_around_the_turned_piece(tmp_path):
 
 def test_a_turned_square_covers_its_own_area_in_the_picture():
     item = turned_box("table", np.array([0.0, 0.4, 0.0]), np.array([2.0, 0.8, 2.0]), 0.3)
-    image = topdown(Scene("a", BEDROOM, (item,)), SoftwareRenderer())
+    image = topdown(Scene("a", BEDROOM, (item,)))
     covered = (image != 255).any(-1).sum() * 0.0125**2
     assert covered == pytest.approx(4.0, rel=0.01)
     for quarter in range(-4, 5):
@@ -111,14 +110,12 @@ def test_a_folder_becomes_scenes_that_are_read_back(tmp_path):
     for name in ("uid_a", "uid_b"):
         save(tmp_path / "theirs", f"{name}/boxes.npz")
     found = read_box_lists(tmp_path / "theirs", BEDROOM)
-    write_scenes(found, tmp_path / "ours", SoftwareRenderer())
+    write_scenes(found, tmp_path / "ours")
     scenes = load_scene_folder(tmp_path / "ours")
     assert len(found) == 2 and [scene.name for scene in scenes] == ["uid_a", "uid_b"]
     (direct,) = read_boxes(tmp_path / "theirs" / "uid_a" / "boxes.npz", "uid_a", BEDROOM)
     np.testing.assert_allclose(scenes[0].sizes_m, direct.sizes_m, atol=1e-5)
-    np.testing.assert_array_equal(
-        topdown(scenes[0], SoftwareRenderer()), topdown(direct, SoftwareRenderer())
-    )
+    np.testing.assert_array_equal(topdown(scenes[0]), topdown(direct))
 
 
 @pytest.mark.parametrize(

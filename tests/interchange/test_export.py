@@ -14,7 +14,6 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.interchange.box_lists import read_box_lists
 from sceneprior.interchange.export import export_scenes
-from sceneprior.render.offscreen import SoftwareRenderer
 from sceneprior.render.scene_files import load_scene_folder
 
 BEDROOM = "front3d_bedroom"
@@ -68,7 +67,7 @@ def test_angles_of_box_lists_come_back(tmp_path):
     }
     (tmp_path / "theirs" / "a").mkdir(parents=True)
     np.savez(tmp_path / "theirs" / "a" / "boxes.npz", **theirs)
-    write_scenes(read_box_lists(tmp_path / "theirs", BEDROOM), tmp_path / "s", SoftwareRenderer())
+    write_scenes(read_box_lists(tmp_path / "theirs", BEDROOM), tmp_path / "s")
     for keep_meshes in (True, False):
         if not keep_meshes:
             (tmp_path / "s" / "a.glb").unlink()

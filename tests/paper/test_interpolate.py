@@ -111,15 +111,15 @@ def test_objects_are_known_by_their_prediction_and_colours_never_jump(trained):
     assert ends > 20 and np.abs(np.diff(colors, axis=0)).max() <= 0.04 * ends + 1
 
 
-def test_pictures_are_taken_from_one_view(trained, renderer, tmp_path):
+def test_pictures_are_taken_from_one_view(trained, tmp_path):
     scenes = interpolate(trained, "seed:1", "seed:2", 3)
-    write_pictures(trained, scenes, tmp_path, renderer)
+    write_pictures(trained, scenes, tmp_path)
     z = torch.from_numpy(np.stack([scene.latent for scene in scenes]))
     height, width = TILE
     assert Image.open(tmp_path / "strip.png").size == (3 * width, height)
     rooms = decode_rooms(trained, z, ["a", "b", "c"])
     view = corner_view([room.scene for room in rooms], TILE)
-    pictures = [perspective(r.scene, renderer, view=view, colors=mixed_colors(r)) for r in rooms]
+    pictures = [perspective(r.scene, view=view, colors=mixed_colors(r)) for r in rooms]
     sheet = strip(pictures * 4)  # more than a row
     assert sheet.shape == (2 * height, 9 * width, 3)
     np.testing.assert_array_equal(sheet[:height, :width], sheet[:height, 3 * width : 4 * width])

@@ -7,7 +7,6 @@ from sceneprior.core.classes import label_set
 from sceneprior.core.palette import quiet_colors
 from sceneprior.core.scene import Opening, Scene, SceneObject
 from sceneprior.render.floor_plans import DOOR, LEGEND_PX, PLAN_PX, WALL, WINDOW, floor_plan
-from sceneprior.render.offscreen import SoftwareRenderer
 from sceneprior.render.topdown import FLOOR_COLOR
 
 BEDROOM = "front3d_bedroom"
@@ -23,36 +22,31 @@ def drawn(picture: np.ndarray, color) -> np.ndarray:
     return np.argwhere((picture[:, :PLAN_PX] == color).all(axis=-1))[:, ::-1]
 
 
-@pytest.fixture
-def renderer() -> SoftwareRenderer:
-    return SoftwareRenderer()
-
-
 @pytest.mark.parametrize("away_m", [0.0, 5.0, 40.0])
-def test_rooms_of_any_size_are_wholly_in_the_picture(renderer, away_m):
+def test_rooms_of_any_size_are_wholly_in_the_picture(away_m):
     bed = box("double_bed", (away_m, 0.3, 0.0), (2.0, 0.6, 1.6))
     lamp = box("ceiling_lamp", (-away_m, 12.0, 0.0), (1.0, 0.2, 1.0))
-    picture = floor_plan(Scene("a", BEDROOM, (bed, lamp)), renderer)
+    picture = floor_plan(Scene("a", BEDROOM, (bed, lamp)))
     assert picture.shape == (PLAN_PX, PLAN_PX + LEGEND_PX, 3)
     for item in (bed, lamp):
         found = drawn(picture, COLORS[item.label])
         assert len(found) and found.min() > 10 and found.max() < PLAN_PX - 10
 
 
-def test_right_is_x_and_down_is_z(renderer):
+def test_right_is_x_and_down_is_z():
     floor_m = np.array([[-2, -2], [2, -2], [2, 2], [-2, 2]], float)
     bed = box("double_bed", (1.0, 0.3, -1.0), (1.0, 0.6, 1.0))
-    picture = floor_plan(Scene("a", BEDROOM, (bed,), floor_m), renderer)
+    picture = floor_plan(Scene("a", BEDROOM, (bed,), floor_m))
     column, row = drawn(picture, COLORS["double_bed"]).mean(axis=0)
     scale = PLAN_PX * 0.9 / 4
     np.testing.assert_allclose((column, row), PLAN_PX / 2 + np.array([1, -1]) * scale, atol=2)
 
 
-def test_floors_walls_and_openings_are_drawn(renderer):
+def test_floors_walls_and_openings_are_drawn():
     floor_m = np.array([[0, 0], [4, 0], [4, 2], [2, 2], [2, 4], [0, 4]], float)
     door = Opening("door", (4, 0.5), (4, 1.4), 0.0, 2.0)
     window = Opening("window", (0.5, 0), (1.5, 0), 0.9, 2.0)
-    picture = floor_plan(Scene("a", BEDROOM, (), floor_m, openings=(door, window)), renderer)
+    picture = floor_plan(Scene("a", BEDROOM, (), floor_m, openings=(door, window)))
     scale = PLAN_PX * 0.9 / 4
     area_m2 = len(drawn(picture, FLOOR_COLOR)) / scale**2
     assert area_m2 == pytest.approx(12, rel=0.03)
@@ -62,16 +56,16 @@ def test_floors_walls_and_openings_are_drawn(renderer):
         assert np.ptp(found[:, axis]) == pytest.approx(length_m * scale, abs=4)
 
 
-def test_each_class_stands_once_in_the_legend(renderer):
+def test_each_class_stands_once_in_the_legend():
     chairs = [box("chair", (x, 0.4, 0.0), (0.5, 0.8, 0.5)) for x in (-1.0, 0.0, 1.0)]
-    one = floor_plan(Scene("a", BEDROOM, tuple(chairs[:1])), renderer)
-    all_three = floor_plan(Scene("a", BEDROOM, tuple(chairs)), renderer)
+    one = floor_plan(Scene("a", BEDROOM, tuple(chairs[:1])))
+    all_three = floor_plan(Scene("a", BEDROOM, tuple(chairs)))
     counts = [
         (picture[:, PLAN_PX:] == COLORS["chair"]).all(axis=-1).sum() for picture in (one, all_three)
     ]
     assert counts[0] == counts[1] > 100
 
 
-def test_an_empty_room_is_an_empty_plan(renderer):
-    picture = floor_plan(Scene("a", BEDROOM), renderer)
+def test_an_empty_room_is_an_empty_plan():
+    picture = floor_plan(Scene("a", BEDROOM))
     assert (picture[:, :PLAN_PX] == 255).all()

@@ -2,14 +2,13 @@
 
 import json
 import re
-import shutil
 import struct
-import subprocess
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import trimesh
+from gltf import validate
 from PIL import Image
 
 from sceneprior.apps.rooms import write_scene, write_scenes
@@ -27,20 +26,14 @@ from sceneprior.core.scene import (
 )
 from sceneprior.core.scene_json import scene_to_json
 from sceneprior.render.floor_plans import floor_plan
-from sceneprior.render.offscreen import open_renderer
 from sceneprior.render.scene_files import (
     load_scene,
     load_scene_folder,
-    read_glb_meshes,
+    read_glb_parts,
     save_scene,
     scene_to_glb,
 )
 from sceneprior.render.topdown import topdown
-
-
-@pytest.fixture(scope="module")
-def renderer():
-    return open_renderer("software")
 
 
 @pytest.fixture
@@ -104,8 +97,8 @@ def test_the_glb_has_named_nodes_in_metres_and_class_colours(scene):
         )
 
 
-def test_what_is_written_comes_back(scene, tmp_path, renderer):
-    write_scene(scene, tmp_path / "new", "room_0", renderer)
+def test_what_is_written_comes_back(scene, tmp_path):
+    write_scene(scene, tmp_path / "new", "room_0")
     files = sorted(path.name for path in (tmp_path / "new").iterdir())
     assert files == ["room_0.glb", "room_0.json", "room_0.png"]
     back = load_scene(tmp_path / "new" / "room_0.json")
@@ -118,8 +111,8 @@ def test_what_is_written_comes_back(scene, tmp_path, renderer):
     np.testing.assert_allclose((high + low) / 2, (1.5, 0.25, -0.5), atol=1e-6)
     np.testing.assert_allclose(high - low, (0.5, 0.5, 0.4), atol=1e-6)
     picture = np.asarray(Image.open(tmp_path / "new" / "room_0.png"))
-    np.testing.assert_array_equal(picture, floor_plan(scene, renderer))
-    np.testing.assert_array_equal(topdown(back, renderer), topdown(scene, renderer))
+    np.testing.assert_array_equal(picture, floor_plan(scene))
+    np.testing.assert_array_equal(topdown(back), topdown(scene))
 
 
 def test_node_transforms_are_applied(tmp_path):
@@ -129,7 +122,7 @@ def test_node_transforms_are_applied(tmp_path):
     shift = trimesh.transformations.translation_matrix([1.0, 2.0, 3.0])
     moved.add_geometry(trimesh.creation.box(), node_name="0_desk", transform=shift)
     (tmp_path / "a.glb").write_bytes(moved.export(file_type="glb"))
-    mesh = read_glb_meshes(tmp_path / "a.glb")["0_desk"]
+    ((mesh, _, _),) = read_glb_parts(tmp_path / "a.glb")["0_desk"]
     np.testing.assert_allclose(mesh.vertices_m.mean(0), [1, 2, 3], atol=1e-6)
 
 
@@ -137,18 +130,16 @@ def test_the_same_scene_gives_the_same_bytes(scene):
     assert scene_to_glb(scene) == scene_to_glb(scene)
 
 
-def test_an_empty_room_is_a_valid_glb_and_comes_back_empty(scene, tmp_path, renderer):
-    write_scene(replace(scene, objects=()), tmp_path, "empty", renderer)
+def test_an_empty_room_is_a_valid_glb_and_comes_back_empty(scene, tmp_path):
+    write_scene(replace(scene, objects=()), tmp_path, "empty")
     data = (tmp_path / "empty.glb").read_bytes()
     assert data[:4] == b"glTF" and struct.unpack("<I", data[8:12])[0] == len(data)
     assert load_scene(tmp_path / "empty.json").objects == ()
 
 
-def test_a_folder_is_read_in_counting_order_and_other_json_is_passed_over(
-    scene, tmp_path, renderer
-):
+def test_a_folder_is_read_in_counting_order_and_other_json_is_passed_over(scene, tmp_path):
     for index in (10, 2, 1):
-        write_scene(replace(scene, name=f"n{index}"), tmp_path, f"room_{index}", renderer)
+        write_scene(replace(scene, name=f"n{index}"), tmp_path, f"room_{index}")
     (tmp_path / "scores.json").write_text('{"format": "sceneprior-scores"}')
     (tmp_path / "room_2.glb").unlink()
     scenes = load_scene_folder(tmp_path)
@@ -156,12 +147,12 @@ def test_a_folder_is_read_in_counting_order_and_other_json_is_passed_over(
     assert scenes[0].objects[0].mesh is not None and scenes[1].objects[0].mesh is None
 
 
-def test_bad_folders_and_files_say_what_to_do(scene, tmp_path, renderer):
+def test_bad_folders_and_files_say_what_to_do(scene, tmp_path):
     with pytest.raises(InputError, match="No folder of scenes at"):
         load_scene_folder(tmp_path / "absent")
     with pytest.raises(InputError, match="holds no scene JSON"):
         load_scene_folder(tmp_path)
-    write_scene(scene, tmp_path, "room", renderer)
+    write_scene(scene, tmp_path, "room")
     (tmp_path / "room.glb").write_bytes(b"glTF nothing")
     with pytest.raises(InputError, match="cannot be read as a GLB"):
         load_scene_folder(tmp_path)
@@ -269,11 +260,11 @@ def test_a_damaged_mesh_of_a_glb_is_refused(scene, tmp_path, part, value, senten
         load_scene(tmp_path / "a.json")
 
 
-def test_rooms_need_names_for_their_files(scene, tmp_path, renderer):
+def test_rooms_need_names_for_their_files(scene, tmp_path):
     with pytest.raises(InputError, match="2 rooms are called 'room'"):
-        write_scenes([scene, scene], tmp_path / "new", renderer)
+        write_scenes([scene, scene], tmp_path / "new")
     with pytest.raises(InputError, match="A room is called 'a/b', which cannot be the name"):
-        write_scenes([replace(scene, name="a/b")], tmp_path / "new", renderer)
+        write_scenes([replace(scene, name="a/b")], tmp_path / "new")
     assert not (tmp_path / "new").exists()
 
 
@@ -347,23 +338,8 @@ def test_a_room_with_walls_is_read_as_its_furniture(tmp_path):
     assert len(item.mesh.faces) == 12
 
 
-VALIDATE = """
-const validator = require("gltf-validator");
-const bytes = new Uint8Array(require("fs").readFileSync(process.argv[1]));
-validator.validateBytes(bytes).then(report => console.log(JSON.stringify(report.issues)));
-"""
-
-
 @pytest.mark.parametrize("shell", ["none", "floor", "walls"])
 def test_the_gltf_validator_finds_nothing(tmp_path, shell):
-    """By gltf-validator of npm: `npm install gltf-validator`, and NODE_PATH names node_modules."""
-    known = shutil.which("node") and subprocess.run(
-        ["node", "-e", "require('gltf-validator')"], capture_output=True
-    )
-    if not known or known.returncode:
-        pytest.skip("no gltf-validator here: npm install gltf-validator, and set NODE_PATH")
     bed = SceneObject("double_bed", (0.0, 0.3, 0.0), (1.8, 0.6, 2.0))
     save_scene(Scene("a", "front3d_bedroom", (bed,)), tmp_path / "a.glb", shell=shell)
-    command = ["node", "-e", VALIDATE, str(tmp_path / "a.glb")]
-    issues = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
-    assert (issues["numErrors"], issues["numWarnings"]) == (0, 0), issues["messages"]
+    validate(tmp_path / "a.glb")

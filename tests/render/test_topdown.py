@@ -1,7 +1,5 @@
 """Scale, position and colours of top-down pictures."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -9,49 +7,42 @@ from sceneprior.core.classes import class_colors
 from sceneprior.core.errors import InputError
 from sceneprior.core.palette import quiet_colors
 from sceneprior.core.scene import Scene, SceneObject
-from sceneprior.render.offscreen import open_renderer
 from sceneprior.render.topdown import (
     TopDownProtocol,
     box_mesh,
     perspective,
     topdown,
     topdown_protocol,
-    turntable,
 )
 
 BED, LAMP = 9, 14  # rows of double_bed and pendant_lamp in the bedroom label set
-
-
-@pytest.fixture(scope="module")
-def renderer():
-    return open_renderer("software")
 
 
 def bedroom(*objects: SceneObject) -> Scene:
     return Scene("room", "front3d_bedroom", objects)
 
 
-def test_a_cube_covers_exactly_its_pixels_with_x_right_and_z_down(renderer):
+def test_a_cube_covers_exactly_its_pixels_with_x_right_and_z_down():
     # 12.5 mm a pixel: 1 m is 80 pixels, and the origin is the corner shared by pixels 255, 256.
     cube = SceneObject("double_bed", (1.0, 0.5, 2.0), (1.0, 1.0, 1.0))
-    image = topdown(bedroom(cube), renderer)
+    image = topdown(bedroom(cube))
     expected = np.full((512, 512, 3), 255, np.uint8)
     expected[256 + 120 : 256 + 200, 256 + 40 : 256 + 120] = class_colors(22)[BED]
     np.testing.assert_array_equal(image, expected)
 
 
-def test_what_is_nearest_to_the_ceiling_wins_whatever_the_order(renderer):
+def test_what_is_nearest_to_the_ceiling_wins_whatever_the_order():
     bed = SceneObject("double_bed", (0.0, 0.3, 0.0), (2.0, 0.6, 2.0))
     lamp = SceneObject("pendant_lamp", (0.0, 2.2, 0.0), (0.5, 0.4, 0.5))
-    image = topdown(bedroom(bed, lamp), renderer)
-    np.testing.assert_array_equal(image, topdown(bedroom(lamp, bed), renderer))
+    image = topdown(bedroom(bed, lamp))
+    np.testing.assert_array_equal(image, topdown(bedroom(lamp, bed)))
     assert tuple(image[256, 256]) == tuple(class_colors(22)[LAMP])
     assert (image == class_colors(22)[BED]).all(-1).sum() == 160**2 - 40**2
 
 
-def test_outlines_darken_borders_and_readers_see_quiet_colours(renderer):
+def test_outlines_darken_borders_and_readers_see_quiet_colours():
     scene = bedroom(SceneObject("desk", (0.0, 0.4, 0.0), (1.0, 0.8, 1.0)))
-    plain, lined = topdown(scene, renderer), topdown(scene, renderer, outlines=True)
+    plain, lined = topdown(scene), topdown(scene, outlines=True)
     quiet = quiet_colors(["desk"])[0]
     recolored = np.where((plain == class_colors(22)[8]).all(-1, keepdims=True), quiet, plain)
     changed = (recolored != lined).any(-1)
@@ -78,12 +69,12 @@ def test_a_box_mesh_is_closed_and_faces_outwards():
     np.testing.assert_allclose(mesh.vertices_m.max(0), [2.0, 3.5, 5.0])
 
 
-def test_the_whole_room_fits_into_the_perspective(renderer):
+def test_the_whole_room_fits_into_the_perspective():
     scene = bedroom(
         SceneObject("wardrobe", (-1.5, 1.0, -1.0), (1.0, 2.0, 0.6)),
         SceneObject("pendant_lamp", (1.0, 2.4, 1.0), (0.5, 0.5, 0.5)),
     )
-    image = perspective(scene, renderer, (120, 160))
+    image = perspective(scene, (120, 160))
     rows, columns = np.nonzero((image != 255).any(-1))
     # 4% of air, half of it on each side, in the direction that is the tighter one.
     fill = (np.ptp(rows) + 1) / 120, (np.ptp(columns) + 1) / 160
@@ -92,24 +83,6 @@ def test_the_whole_room_fits_into_the_perspective(renderer):
     assert columns.min() + columns.max() == pytest.approx(159, abs=2)
 
 
-def test_a_turntable_goes_once_round_at_one_scale(renderer):
-    bed = SceneObject("double_bed", (0.0, 0.3, 0.0), (1.8, 0.6, 2.0))
-    lamp = SceneObject("pendant_lamp", (1.0, 2.0, 0.0), (0.3, 0.3, 0.3))
-    scene = Scene("room", "front3d_bedroom", (bed, lamp))
-    pictures = turntable(scene, renderer, count=4, image_size=(60, 80))
-    assert len(pictures) == 4 and {picture.shape for picture in pictures} == {(60, 80, 3)}
-    assert len({picture.tobytes() for picture in pictures}) == 4
-    # Nothing is cut off, and somewhere the room comes near the picture's edge.
-    shown = [np.argwhere((picture != 255).any(axis=-1)) for picture in pictures]
-    low, high = np.concatenate(shown).min(axis=0), np.concatenate(shown).max(axis=0)
-    assert (low >= 1).all() and (high <= [58, 78]).all()
-    assert min(low[0], low[1], 59 - high[0], 79 - high[1]) <= 3
-    # Half way round, what was in front of the bed is behind it: the same floor from the other side.
-    half = turntable(replace(scene, objects=(bed,)), renderer, count=2, image_size=(60, 80))
-    apart = np.abs(half[0].astype(int) - half[1]).max(axis=-1)
-    assert (apart > 40).mean() < 0.02  # the bed and its floor look the same from both sides
-
-
-def test_an_empty_room_is_background(renderer):
-    assert (topdown(bedroom(), renderer) == 255).all()
-    assert perspective(bedroom(), renderer, (60, 80)).shape == (60, 80, 3)
+def test_an_empty_room_is_background():
+    assert (topdown(bedroom()) == 255).all()
+    assert perspective(bedroom(), (60, 80)).shape == (60, 80, 3)

@@ -11,7 +11,6 @@ from sceneprior.apps.cli.options import (
     FloorOption,
     InceptionOption,
     OpeningsOption,
-    RendererOption,
     RequestOption,
     ScenesOption,
     SeedOption,
@@ -29,12 +28,6 @@ SomeRunOption = Annotated[
 ]
 AlexnetOption = Annotated[
     Path | None, typer.Option(help="The file alexnet-owt-7be5be79.pth, for the paper's SCA.")
-]
-ReferenceOption = Annotated[
-    Path | None,
-    typer.Option(
-        help="File (.npz) that keeps the features of real rooms' pictures; read if it exists."
-    ),
 ]
 SplitOption = Annotated[
     str, typer.Option(help="Rooms to compare with: test to report, val to choose settings.")
@@ -65,13 +58,11 @@ def eval_fid(
     shards: Annotated[
         Path | None, typer.Option(help="Shards with the test rooms (default: those of the run).")
     ] = None,
-    reference: ReferenceOption = None,
     split: SplitOption = "test",
     boxes: BoxesOption = False,
     resamples: ResamplesOption = 200,
     out: OutOption = None,
     distribution: DistributionOption = None,
-    renderer: RendererOption = "auto",
 ) -> None:
     """Compare generated rooms with test rooms, by the distributions of docs/evaluation.md.
 
@@ -84,7 +75,7 @@ def eval_fid(
     from sceneprior.evaluation.synthesis import EvalOptions
 
     _check_source(run, scenes, distribution)
-    options = EvalOptions(seed, inception, alexnet, reference, split, boxes, resamples, renderer)
+    options = EvalOptions(seed, inception, alexnet, split, boxes, resamples)
     if run is not None:
         target = result_file(run, out, "scores.json")
         found = evaluate_run(run, count or GENERATED, options, target, shards, distribution)
@@ -136,7 +127,6 @@ def evaluate(
     ] = "solids",
     inception: InceptionOption = None,
     alexnet: AlexnetOption = None,
-    reference: ReferenceOption = None,
     split: SplitOption = "test",
     boxes: BoxesOption = False,
     resamples: ResamplesOption = 200,
@@ -147,7 +137,6 @@ def evaluate(
     ceiling: CeilingOption = None,
     want: WantOption = None,
     request: RequestOption = None,
-    renderer: RendererOption = "auto",
 ) -> None:
     """Measure whether rooms can be used, and compare them with real rooms, as eval-fid does.
 
@@ -161,7 +150,7 @@ def evaluate(
 
     _check_source(run, scenes, distribution)
     asked: dict[str, Any] = request_of(floor, openings, ceiling, want, request)
-    options = EvalOptions(seed, inception, alexnet, reference, split, boxes, resamples, renderer)
+    options = EvalOptions(seed, inception, alexnet, split, boxes, resamples)
     use = UseOptions(settle, only_use, standing)
     if run is not None:
         target = result_file(run, out, "scores.json")

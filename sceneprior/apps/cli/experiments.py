@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from sceneprior.apps.cli.options import AcceleratorOption, InceptionOption, RendererOption
+from sceneprior.apps.cli.options import AcceleratorOption, InceptionOption
 from sceneprior.core.errors import InputError
 
 
@@ -25,15 +25,12 @@ def compare(
         str,
         typer.Option(help="Comparison: your YAML, or a shipped one (compare/single_view.yaml)."),
     ] = "compare/new_rooms_small.yaml",
-    out: Annotated[Path, typer.Option(help="Folder for runs, tables and pictures.")] = Path(
-        "out/compare"
-    ),
+    out: Annotated[Path, typer.Option(help="Folder for runs and tables.")] = Path("out/compare"),
     methods: Annotated[str | None, typer.Option(help="Methods, such as lifted,lstm.")] = None,
     rooms: Annotated[str | None, typer.Option(help="Kinds of rooms, such as bedroom.")] = None,
     seeds: Annotated[str | None, typer.Option(help="Seeds, such as 0,1 (default: all).")] = None,
     inception: InceptionOption = None,
     accelerator: AcceleratorOption = "auto",
-    renderer: RendererOption = "auto",
 ) -> None:
     """Train and evaluate methods on the same rooms, and tabulate them; run again to continue."""
     from sceneprior.apps.experiments.compare import CompareOptions
@@ -43,14 +40,14 @@ def compare(
     comparison = load_comparison(config)
     part = part_of(comparison, methods, rooms, seeds)
     with _stopped_by_ctrl_c():
-        options = CompareOptions(renderer, inception, accelerator)
+        options = CompareOptions(inception, accelerator)
         done = run_comparison(comparison, part, out, options)
     if done.table is not None:
         typer.echo(f"Wrote {done.table}")
     if done.left_out:
         typer.echo(
             "Not in the table, since trained or evaluated otherwise (settings, rooms, seed, "
-            f"renderer or weights): {'; '.join(done.left_out)}. Name them in the options to "
+            f"weights): {'; '.join(done.left_out)}. Name them in the options to "
             "evaluate them again.",
             err=True,
         )
@@ -67,11 +64,10 @@ def demo(
     config: Annotated[str, typer.Option(help="Config of the training run.")] = "demo.yaml",
     rooms: Annotated[int, typer.Option(min=20, help="Number of homes to make.")] = 240,
     count: Annotated[int, typer.Option(min=2, help="Number of rooms to generate.")] = 200,
-    renderer: RendererOption = "auto",
 ) -> None:
     """Run the whole pipeline on procedural homes: shards, training, new rooms, scores, a page."""
     from sceneprior.apps.experiments.demo import run_demo
 
     with _stopped_by_ctrl_c():
-        run_demo(out, config, rooms, count, renderer)
+        run_demo(out, config, rooms, count)
     typer.echo(f"Open {out / 'report.html'}; scores are in {out / 'scores.json'}.")

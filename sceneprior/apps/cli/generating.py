@@ -19,7 +19,6 @@ from sceneprior.apps.cli.options import (
     FloorOption,
     OpeningsOption,
     OverwriteOption,
-    RendererOption,
     RequestOption,
     RunOption,
     SeedOption,
@@ -51,7 +50,6 @@ def synthesize(
     ] = False,
     shell: ShellOption = None,
     overwrite: OverwriteOption = False,
-    renderer: RendererOption = "software",
 ) -> None:
     """Generate rooms: JSON, GLB and a top-down PNG each, and latents if the method has them.
 
@@ -61,20 +59,18 @@ def synthesize(
     from sceneprior.apps.rooms import PAGE_FILE, check_free, write_scenes
     from sceneprior.evaluation.metrics.contents import emptiness
     from sceneprior.evaluation.rooms_page import write_rooms_page
-    from sceneprior.render.offscreen import open_renderer
 
     check_free(out, overwrite)
     drawn = checked_shell(shell or "none")
     asked = request_of(floor, openings, ceiling, want, request)
     prior = load(run)
-    artist = open_renderer(renderer)
     scenes = prior.sample(count, seed, distribution, **asked, cad=cad)
-    write_scenes(scenes, out, artist, drawn)
+    write_scenes(scenes, out, drawn)
     note_unmet(scenes)
     origin = distribution or prior.distribution
     if html:
         told = f"run {Path(run).resolve().name} · seed {seed} · from: {origin}"
-        write_rooms_page(out / PAGE_FILE, scenes, artist, title="New rooms", subtitle=told)
+        write_rooms_page(out / PAGE_FILE, scenes, title="New rooms", subtitle=told)
     typer.echo(f"Wrote {count} rooms to {out} (from: {origin})")
     if (warning := emptiness(scenes)) is not None:
         typer.echo(f"Warning: {warning}", err=True)
@@ -90,20 +86,17 @@ def interpolate(
     out: Annotated[Path, typer.Option(help="Folder for the rooms and pictures.")],
     steps: Annotated[int, typer.Option(min=2, max=1000, help="Rooms, both ends included.")] = 9,
     overwrite: OverwriteOption = False,
-    renderer: RendererOption = "software",
 ) -> None:
     """Interpolate between two rooms on the sphere: rooms, a strip and an animation."""
     from sceneprior.apps.api import load
     from sceneprior.apps.rooms import check_free, write_scenes
     from sceneprior.paper.interpolate import write_pictures
-    from sceneprior.render.offscreen import open_renderer
 
     check_free(out, overwrite)
     prior = load(run)
     scenes = prior.interpolate(start, end, steps)
-    artist = open_renderer(renderer)
-    write_scenes(scenes, out, artist)
-    write_pictures(prior.with_latents, scenes, out, artist)
+    write_scenes(scenes, out)
+    write_pictures(prior.with_latents, scenes, out)
     typer.echo(f"Wrote {steps} rooms, strip.png and animation.gif to {out}")
 
 
@@ -126,7 +119,6 @@ def complete(
     distribution: DistributionOption = None,
     shell: ShellOption = None,
     overwrite: OverwriteOption = False,
-    renderer: RendererOption = "software",
 ) -> None:
     """Complete a room, given some objects and optionally the floor.
 
@@ -137,18 +129,17 @@ def complete(
 
     from sceneprior.apps.api import load
     from sceneprior.apps.rooms import check_free, write_scenes
-    from sceneprior.render.offscreen import open_renderer
     from sceneprior.render.scene_files import load_scene
 
     check_free(out, overwrite)
     drawn = checked_shell(shell or "none")
     asked = request_of(floor, openings, ceiling, want, request)
-    scene = load_scene(given)
+    scene = load_scene(given, with_materials=True)
     scene = replace(scene, objects=(*scene.objects, *asked.pop("objects", ())))
     wanted = None if classes is None else [label.strip() for label in classes.split(",")]
     prior = load(run)
     scenes = prior.complete(scene, count, seed, distribution, wanted, **asked, cad=cad)
-    write_scenes(scenes, out, open_renderer(renderer), drawn)
+    write_scenes(scenes, out, drawn)
     note_unmet(scenes)
     how = "drawn by the sampler" if scenes[0].latent is None else "decoded from fitted latents"
     typer.echo(f"Wrote {count} rooms around {len(scene.objects)} given objects, {how}, to {out}")
@@ -165,7 +156,6 @@ def retrieve(
     ] = None,
     cache: CacheOption = None,
     overwrite: OverwriteOption = False,
-    renderer: RendererOption = "software",
 ) -> None:
     """Replace every object by the most similar CAD model of its class."""
     from rich.console import Console
@@ -177,7 +167,6 @@ def retrieve(
     from sceneprior.apps.rooms import check_free, write_scenes
     from sceneprior.core.files import write_json
     from sceneprior.evaluation.metrics.contents import common_label_set
-    from sceneprior.render.offscreen import open_renderer
     from sceneprior.render.scene_files import load_scene_folder
 
     check_free(out, overwrite)
@@ -193,7 +182,7 @@ def retrieve(
     chosen = retrieve_all(rooms, cad_models)
     made = list(track(chosen, "Choosing models", total=len(rooms), console=console))
     report = retrieval_report(made, cad_models)
-    write_scenes(made, out, open_renderer(renderer))
+    write_scenes(made, out)
     write_json(out / "retrieval.json", report)
     typer.echo(f"Gave {report['objects_with_a_model']} of {report['objects']} objects a model")
     if report["classes_without_models"]:

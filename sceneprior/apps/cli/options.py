@@ -13,9 +13,6 @@ if TYPE_CHECKING:
     from sceneprior.core.scene import Scene
     from sceneprior.core.shell import ShellName
 
-RendererOption = Annotated[
-    str, typer.Option(help="Renderer of the pictures: auto, pyrender or software (without GL).")
-]
 RunOption = Annotated[
     str,
     typer.Option(

@@ -8,7 +8,6 @@ import typer
 from sceneprior.apps.cli.options import (
     MODELS_HELP,
     OverwriteOption,
-    RendererOption,
     RunOption,
     SeedOption,
     checked_target,
@@ -56,18 +55,16 @@ def reconstruct(
     restarts: RestartsOption = 1,
     seed: SeedOption = 0,
     overwrite: OverwriteOption = False,
-    renderer: RendererOption = "auto",
 ) -> None:
     """Reconstruct rooms from the instance masks of single images: JSON, GLB and pictures."""
     from sceneprior.apps.api import load
-    from sceneprior.apps.reconstruction.export import write_reconstructions, write_turning
+    from sceneprior.apps.reconstruction.export import write_page, write_reconstructions
     from sceneprior.apps.reconstruction.own_image import read_own_image
     from sceneprior.apps.reconstruction.reconstruct import OBJECTS
     from sceneprior.apps.rooms import check_free
     from sceneprior.core.errors import InputError
     from sceneprior.core.geometry.turns import QUARTERS
     from sceneprior.core.observed_image import image_from_shards, images_of_split
-    from sceneprior.render.offscreen import open_renderer
 
     ways = [mask is not None, room is not None, split is not None]
     if sum(ways) != 1 or (shards is None) != (mask is not None):
@@ -111,10 +108,9 @@ def reconstruct(
         typer.echo(
             f"Note: the run never generates the class {name}; a {other} is used instead.", err=True
         )
-    artist = open_renderer(renderer)
-    write_reconstructions(found, out, artist)
+    write_reconstructions(found, out)
     if mask is not None:
-        write_turning(found[0], out, artist)
+        write_page(found[0], out)
     typer.echo(f"Wrote {len(found)} room{'s' * (len(found) != 1)} to {out}")
 
 
@@ -137,7 +133,6 @@ def eval_svr(
         typer.Option(help=f"CAD models to evaluate the fits with, too: {MODELS_HELP}"),
     ] = None,
     seed: SeedOption = 0,
-    renderer: RendererOption = "auto",
 ) -> None:
     """Evaluate single-view reconstruction, with training rooms as baselines."""
     from sceneprior.apps.reconstruction.reconstruct import FitOptions
@@ -150,7 +145,7 @@ def eval_svr(
     from sceneprior.core.errors import InputError
     from sceneprior.core.files import write_json
 
-    protocol = SvrProtocol(shards, split, seed, views, renderer)
+    protocol = SvrProtocol(shards, split, seed, views)
     if run is not None and scenes is None:
         options = FitOptions(fit, restarts)
         target = result_file(run, out, "svr.json")

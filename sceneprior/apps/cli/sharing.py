@@ -128,7 +128,6 @@ def export(
     from sceneprior.apps.rooms import check_free, write_scenes
     from sceneprior.interchange.box_lists import read_box_lists
     from sceneprior.interchange.export import export_scenes
-    from sceneprior.render.offscreen import SoftwareRenderer
     from sceneprior.render.scene_files import load_scene_folder
 
     check_free(out, overwrite)
@@ -136,11 +135,11 @@ def export(
         if label_set is None:
             raise InputError("--to scenes needs --label-set, the label set of the box lists.")
         rooms = read_box_lists(source, label_set, classes, sizes or "half")
-        write_scenes(rooms, out, SoftwareRenderer())
+        write_scenes(rooms, out)
     else:
         if (label_set, classes, sizes) != (None, None, None):
             raise InputError("--label-set, --classes and --sizes apply only with --to scenes.")
-        rooms = load_scene_folder(source)
+        rooms = load_scene_folder(source, with_materials=True)
         asked = None if shell is None else checked_shell(shell)
         for note in export_scenes(rooms, to, out, asked):
             typer.echo(f"Note: {note}", err=True)

@@ -7,7 +7,6 @@ import typer
 
 from sceneprior.apps.cli.options import (
     AcceleratorOption,
-    RendererOption,
     ScenesOption,
     SeedOption,
     checked_target,
@@ -68,7 +67,6 @@ def report(
     command: Annotated[
         list[str] | None, typer.Option(help="Command to list on the page; repeatable.")
     ] = None,
-    renderer: RendererOption = "auto",
 ) -> None:
     """Write one self-contained HTML page of a run or of scenes: inputs, curves, rooms, scores."""
     from sceneprior.apps.experiments.evaluate import report_folder, report_run
@@ -78,12 +76,12 @@ def report(
         target = out or run / "report.html"
         if run.is_dir():
             checked_target(target)
-        report_run(run, scores, target, seed, commands, renderer)
+        report_run(run, scores, target, seed, commands)
     elif scenes is not None and shards is not None and run is None:
         if seed != 0:
             raise InputError("--seed belongs to --run; scenes are shown as they are.")
         target = checked_target(out or scenes / "report.html")
-        report_folder(scenes, shards, scores, target, commands, renderer)
+        report_folder(scenes, shards, scores, target, commands)
     else:
         raise InputError(
             "Say what to report on: either --run RUN, or --scenes DIR --shards SHARDS."

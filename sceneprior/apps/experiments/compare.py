@@ -1,4 +1,4 @@
-"""Trains and evaluates the runs of a comparison, and writes its tables and pictures.
+"""Trains and evaluates the runs of a comparison, and writes its tables.
 
 A run consists of `fit` and the commands that score it; for existing scenes, of the scoring commands
 alone. Finished commands are not repeated.
@@ -19,7 +19,6 @@ from sceneprior.apps.experiments.comparison import (
     shards_of,
     variants_of,
 )
-from sceneprior.apps.experiments.figure import write_figure
 from sceneprior.apps.experiments.rows import rows_of
 from sceneprior.apps.experiments.steps import Step, StepRunner, is_done, open_runner
 from sceneprior.apps.experiments.table import NEW_ROOMS, VIEWS, write_tables
@@ -27,7 +26,6 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.ground_truth import known_in_3d
 from sceneprior.core.shards import iterate_rooms
 from sceneprior.evaluation.networks import check_inception
-from sceneprior.render.offscreen import open_renderer
 
 OF_SHARDS = "shards"
 """Value of `cad_models` that selects the CAD models of the training rooms."""
@@ -37,7 +35,6 @@ OF_SHARDS = "shards"
 class CompareOptions:
     """Options for training and evaluating all runs of a comparison."""
 
-    renderer: str = "auto"
     inception: Path | None = None
     """NVIDIA's `inception-2015-12-05.pt`; None leaves FID out."""
     accelerator: str = "auto"
@@ -60,14 +57,13 @@ class Compared:
 def compare(
     comparison: Comparison, part: Comparison, out: Path, options: CompareOptions
 ) -> Compared:
-    """Finish the runs of `part`, then write tables and pictures of all finished runs.
+    """Finish the runs of `part`, then write the tables of all finished runs.
 
-    The folder of a run is `<out>/<rooms>/<method>/seed<k>/`; tables and pictures are written to
-    `out`. Ctrl-C, SIGTERM and SIGHUP raise KeyboardInterrupt; a second, identical call continues.
+    The folder of a run is `<out>/<rooms>/<method>/seed<k>/`; tables are written to `out`. Ctrl-C,
+    SIGTERM and SIGHUP raise KeyboardInterrupt; a second, identical call continues.
     """
     if options.inception is not None:
         check_inception(options.inception)
-    renderer = open_renderer(options.renderer)
     count = cache(partial(count_of, comparison))
     for rooms in part.rooms:
         count(rooms)  # unusable shards raise here, before anything is trained
@@ -86,10 +82,6 @@ def compare(
         if done:
             form = VIEWS if isinstance(comparison, ViewComparison) else NEW_ROOMS
             write_tables([row for run in done for row in rows_of(comparison, run)], out, form)
-        for rooms in comparison.rooms:
-            first = {run.method: run for run in reversed(done) if run.rooms == rooms}
-            if shown := [first[method] for method in comparison.methods if method in first]:
-                write_figure(comparison, shown, count(rooms), out / f"{rooms}.png", renderer)
     return Compared(out / "table.md" if done else None, failures, left_out)
 
 
@@ -178,11 +170,11 @@ def scoring_steps(
     """
     shards, state = str(shards_of(comparison, run.rooms)), []
     source = ["--run", str(run.folder / "run")]
-    seed, renderer = ["--seed", str(comparison.sampling_seed)], ["--renderer", options.renderer]
+    seed = ["--seed", str(comparison.sampling_seed)]
     if isinstance(comparison, ViewComparison):
         command, option = "eval-svr", "--fit"
         source += ["--shards", shards]
-        alike = ["--split", "test", "--views", str(comparison.views), *seed, *renderer]
+        alike = ["--split", "test", "--views", str(comparison.views), *seed]
         if count is not None:
             alike += ["--limit", str(count)]
         if (models := comparison.cad_models) is not None:
@@ -192,7 +184,7 @@ def scoring_steps(
         if run.scenes is not None:
             source, state = ["--scenes", str(run.scenes), "--shards", shards], [_state(run.scenes)]
         # Some methods decode meshes, others boxes only; --boxes compares the boxes of all methods.
-        alike = ["-n", str(count), *seed, "--boxes", *renderer]
+        alike = ["-n", str(count), *seed, "--boxes"]
         if options.inception is not None:
             alike += ["--inception", str(options.inception)]
     steps = []

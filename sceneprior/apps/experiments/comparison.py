@@ -106,7 +106,7 @@ class RoomComparison(Comparison):
         ("paper", "kernel"), min_length=1, strict=False
     )
     """Distributions of latents for evaluating priors that keep the latents of training rooms, one
-    row each. Pictures show the first. Other methods are evaluated with their own distribution."""
+    row each. Other methods are evaluated with their own distribution."""
 
 
 class ViewComparison(Comparison):

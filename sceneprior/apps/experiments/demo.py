@@ -13,12 +13,12 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.files import write_json
 
 
-def run_demo(out: Path, config: str, rooms: int, count: int, renderer: str) -> None:
+def run_demo(out: Path, config: str, rooms: int, count: int) -> None:
     """Run every unfinished step, then add time and memory to the scores.
 
     Ctrl-C, SIGTERM and SIGHUP raise KeyboardInterrupt; a second, identical call continues.
     """
-    steps = demo_steps(out, config, rooms, count, renderer)
+    steps = demo_steps(out, config, rooms, count)
     with open_runner(out) as runner:
         for step in steps:
             if is_done(step, out):
@@ -40,25 +40,24 @@ def run_demo(out: Path, config: str, rooms: int, count: int, renderer: str) -> N
         _add_costs(out)
 
 
-def demo_steps(out: Path, config: str, rooms: int, count: int, renderer: str) -> list[Step]:
+def demo_steps(out: Path, config: str, rooms: int, count: int) -> list[Step]:
     """The demo's commands in order; a command is repeated if its arguments or the contents of
     `config` change."""
     homes, shards, run, scenes = (str(out / name) for name in ("homes", "shards", "run", "scenes"))
     scores, page = str(out / "scores.json"), str(out / "report.html")
-    draw = ["--renderer", renderer]
     commands = {
         "homes": ["make-homes", homes, "--rooms", str(rooms), "--seed", "0"],
         "shards": [
             "prep-front", "--front", f"{homes}/3D-FRONT", "--future", f"{homes}/3D-FUTURE-model",
             "--splits", f"{homes}/splits/bedroom.csv", "--recipe", "bedroom",
-            "--out", shards, *draw,
+            "--out", shards,
         ],
         "fit": [
             "fit", "--config", config, "--run", run, "--set", f"data.shards={shards}", "--resume",
         ],
-        "scenes": ["synthesize", "--run", run, "-n", "16", "--out", scenes, "--overwrite", *draw],
-        "scores": ["eval-fid", "--run", run, "-n", str(count), "--out", scores, *draw],
-        "report": ["report", "--run", run, "--scores", scores, "--out", page, *draw],
+        "scenes": ["synthesize", "--run", run, "-n", "16", "--out", scenes, "--overwrite"],
+        "scores": ["eval-fid", "--run", run, "-n", str(count), "--out", scores],
+        "report": ["report", "--run", run, "--scores", scores, "--out", page],
     }  # fmt: skip
     settings = load_config(config)
     last = settings.stages()[-1].name

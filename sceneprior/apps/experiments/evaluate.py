@@ -27,7 +27,6 @@ from sceneprior.evaluation.use import UseOptions, evaluate_use
 from sceneprior.paper.decode import decode_latents, decode_training_rooms
 from sceneprior.paper.sampling import marked
 from sceneprior.paper.trained import TrainedPrior
-from sceneprior.render.offscreen import open_renderer
 from sceneprior.render.scene_files import load_scene_folder
 from sceneprior.training.method import Trained, TrainedSampler
 
@@ -163,7 +162,6 @@ def report_run(
     out: Path,
     seed: int,
     commands: tuple[str, ...],
-    renderer: str,
 ) -> None:
     """Write the report page of a run, without comparisons if the rooms have no 3D ground truth."""
     trained = load_any_run(run)
@@ -192,7 +190,6 @@ def report_run(
         curves=read_curves(run),
         decoded=decoded,
         unfolding=unfolding,
-        renderer=open_renderer(renderer),
     )
 
 
@@ -202,7 +199,6 @@ def report_folder(
     scores: Path | None,
     out: Path,
     commands: tuple[str, ...],
-    renderer: str,
 ) -> None:
     """Write the report page of the user's scenes, made by any method, without the parts that need
     a run."""
@@ -216,7 +212,6 @@ def report_folder(
         generated=scenes[:ROOMS_SHOWN],
         scores=read_scores(scores, folder, shards, f"--scenes {folder} --shards {shards}"),
         commands=commands,
-        renderer=open_renderer(renderer),
     )
 
 

@@ -17,31 +17,26 @@ from sceneprior.core.palette import quiet_colors
 from sceneprior.core.scene import Scene
 from sceneprior.evaluation.page import png_uri
 from sceneprior.evaluation.rooms_page import write_rooms_page
-from sceneprior.render.offscreen import Pinhole, Renderer
-from sceneprior.render.pictures import gif_bytes, paint_ids, png_bytes
+from sceneprior.render.offscreen import Pinhole, SoftwareRenderer
+from sceneprior.render.pictures import paint_ids, png_bytes
 from sceneprior.render.topdown import (
     object_colors,
     scene_meshes,
     topdown,
     topdown_protocol,
-    turntable,
 )
 
 HEIGHT_PX = 360
 """Height of each panel, to which masks are scaled."""
 GAP_PX, LINE_PX = 8, 24
 PAPER, INK, FRAME = (255, 255, 255), (40, 40, 40), (200, 200, 200)
-TURN_MS = 3600
-"""Duration of the turntable animation."""
 MARGIN_M = 0.3
 """Smallest margin around the camera in the top view."""
 SIGHT_M = 0.8
 """Length of the lines that show the field of view in the top view."""
 
 
-def write_reconstructions(
-    found: Sequence[Reconstruction], folder: Path, renderer: Renderer
-) -> None:
+def write_reconstructions(found: Sequence[Reconstruction], folder: Path) -> None:
     """Write `<name>.json`, `.glb` and `.png`, and `<name>_seen.png`, for each image.
 
     The JSON's `extra` holds the image's room and view, its camera, and the scores of the fit.
@@ -60,33 +55,29 @@ def write_reconstructions(
             "steps": one.steps,
             "taken_for": one.taken_for,
         }
-        write_whole(Path(folder) / f"{image.name}_seen.png", png_bytes(picture(one, renderer)))
-        write_scene(replace(one.scene, extra=extra), folder, image.name, renderer)
+        write_whole(Path(folder) / f"{image.name}_seen.png", png_bytes(picture(one)))
+        write_scene(replace(one.scene, extra=extra), folder, image.name)
 
 
-def write_turning(found: Reconstruction, folder: Path, renderer: Renderer) -> None:
-    """Write `<name>_turning.gif` and `rooms.html` to the folder of `write_reconstructions`."""
-    name, frames = found.image.name, turntable(found.scene, renderer)
-    gif = gif_bytes(frames, [TURN_MS // len(frames)] * len(frames))
-    write_whole(Path(folder) / f"{name}_turning.gif", gif)
-    seen = png_uri(Image.fromarray(picture(found, renderer)))
+def write_page(found: Reconstruction, folder: Path) -> None:
+    """Write `rooms.html` to the folder of `write_reconstructions`."""
+    seen = png_uri(Image.fromarray(picture(found)))
     write_rooms_page(
         Path(folder) / PAGE_FILE,
         [found.scene],
-        renderer,
-        title=name,
+        title=found.image.name,
         subtitle="A room from the masks of one image",
         pictures=[("The masks, the reconstruction from the same camera, and from above", seen)],
     )
 
 
-def picture(found: Reconstruction, renderer: Renderer) -> UInt8[np.ndarray, "height width 3"]:
+def picture(found: Reconstruction) -> UInt8[np.ndarray, "height width 3"]:
     """Three panels (masks, camera view, top view) with titles and a legend, coloured by class."""
     image, scene = found.image, found.scene
     panels = {
         "masks given": masks_of(image),
-        "found, same camera": from_camera(scene, image, renderer),
-        "found, from above": from_above(scene, image, renderer),
+        "found, same camera": from_camera(scene, image),
+        "found, from above": from_above(scene, image),
     }
     tiles = [_as_tile(panel) for panel in panels.values()]
     width = sum(tile.width for tile in tiles) + GAP_PX * (len(tiles) - 1)
@@ -113,13 +104,13 @@ def masks_of(image: ObservedImage) -> UInt8[np.ndarray, "height width 3"]:
     return paint_ids(image.instance_ids.astype(np.int64), colors, PAPER)
 
 
-def from_camera(
-    scene: Scene, image: ObservedImage, renderer: Renderer
-) -> UInt8[np.ndarray, "height width 3"]:
+def from_camera(scene: Scene, image: ObservedImage) -> UInt8[np.ndarray, "height width 3"]:
     """Shaded picture of a scene from the camera of an image."""
     camera = Pinhole(image.world_to_camera.astype(np.float64), image.intrinsics.astype(np.float64))
     height, width = image.instance_ids.shape
-    return renderer.shaded(scene_meshes(scene), object_colors(scene), camera, (height, width))
+    return SoftwareRenderer().shaded(
+        scene_meshes(scene), object_colors(scene), camera, (height, width)
+    )
 
 
 def _as_tile(panel: UInt8[np.ndarray, "height width 3"]) -> Image.Image:
@@ -150,9 +141,7 @@ def _legend_rows(
     return rows
 
 
-def from_above(
-    scene: Scene, image: ObservedImage, renderer: Renderer
-) -> UInt8[np.ndarray, "height width 3"]:
+def from_above(scene: Scene, image: ObservedImage) -> UInt8[np.ndarray, "height width 3"]:
     """Top-down picture of the reconstruction, with the camera and its field of view."""
     turn, eye = image.world_to_camera[:3, :3].astype(np.float64), image.eye_m
     reach_m = [np.abs(scene.centers_m) + scene.sizes_m / 2, np.abs(eye) + MARGIN_M]
@@ -160,7 +149,7 @@ def from_above(
     protocol = topdown_protocol(scene.label_set)
     window_m = max(protocol.window_m, widest_m)  # unlike in metrics, nothing is cut off
     protocol = replace(protocol, image_size=(HEIGHT_PX, HEIGHT_PX), window_m=window_m)
-    plan = Image.fromarray(topdown(scene, renderer, protocol, outlines=True))
+    plan = Image.fromarray(topdown(scene, protocol, outlines=True))
 
     def pixel(point_m: np.ndarray) -> tuple[float, float]:
         x, z = point_m[[0, 2]] / protocol.metres_per_pixel + HEIGHT_PX / 2

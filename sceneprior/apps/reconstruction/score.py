@@ -26,7 +26,7 @@ from sceneprior.lifted.reconstruction.known_rooms import (
     nearest_answers,
     random_answers,
 )
-from sceneprior.render.offscreen import open_renderer
+from sceneprior.render.offscreen import SoftwareRenderer
 from sceneprior.render.scene_files import load_scene_folder
 
 TITLES = {
@@ -64,7 +64,6 @@ class SvrProtocol:
     """Seed of the random training rooms and, for runs, of the views."""
     views: int = 1
     """Number of views drawn from each room to evaluate a run; all if a room has fewer."""
-    renderer: str = "auto"
 
     def as_dict(self) -> dict[str, Any]:
         """The protocol, for a result file."""
@@ -183,7 +182,7 @@ def score_answers(
 ) -> dict[str, Any]:
     """Scores by row: rows of the given reconstructions, and baseline rows of training rooms."""
     rooms = known_rooms(protocol.shards)
-    nearest = nearest_answers(rooms, images, open_renderer(protocol.renderer))
+    nearest = nearest_answers(rooms, images, SoftwareRenderer())
     drawn = random_answers(rooms, images, protocol.seed)
     answers = {
         **answers,

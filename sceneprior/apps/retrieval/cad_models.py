@@ -20,7 +20,7 @@ from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import file_stamp, write_whole
 from sceneprior.core.geometry.surfaces import surface_points
-from sceneprior.core.scene import Mesh
+from sceneprior.core.scene import Mesh, Textured
 
 POINTS = 1024
 """Points per surface; on a surface of 2 m2, one every 4 to 5 cm."""
@@ -30,6 +30,7 @@ FORMAT = 1
 _FLAT = 1e-9
 """Ratio to the longest side up to which a side counts as flat; flat sides are not scaled."""
 _MESHES_KEPT = 256
+_TEXTURED_KEPT = 32
 
 Track = Callable[[list[str]], Iterable[str]]
 """Wraps an iteration over model ids, for a progress bar."""
@@ -51,6 +52,8 @@ class CadModels:
     by_class: Mapping[str, ClassModels]
     load: Callable[[str], Mesh]
     """Loads the mesh of a model id, scaled to fill [-0.5, 0.5]^3."""
+    textured: Callable[[str], tuple[Textured, ...]] = lambda model_id: ()
+    """Loads the parts of this mesh with their materials; none for a model without materials."""
     broken: Mapping[str, str] = field(default_factory=dict)
     """Ids of unusable models, each with the reason."""
 
@@ -93,7 +96,16 @@ def open_models(
     def load(model_id: str) -> Mesh:
         return unit_mesh(found.read(files[model_id]))
 
-    return CadModels(by_class, lru_cache(_MESHES_KEPT)(load), broken)
+    def textured(model_id: str) -> tuple[Textured, ...]:
+        whole = np.asarray(found.read(files[model_id]).vertices_m, dtype=np.float64)
+        return tuple(
+            part._replace(mesh=Mesh(unit_points(part.mesh.vertices_m, whole), part.mesh.faces))
+            for part in found.textured(files[model_id])
+        )
+
+    return CadModels(
+        by_class, lru_cache(_MESHES_KEPT)(load), lru_cache(_TEXTURED_KEPT)(textured), broken
+    )
 
 
 def unit_mesh(mesh: Mesh) -> Mesh:

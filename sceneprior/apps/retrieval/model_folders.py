@@ -10,8 +10,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-
 from sceneprior.core.classes import LABEL_SETS, label_set
 from sceneprior.core.errors import InputError, InputWarning
 from sceneprior.core.files import is_name
@@ -25,9 +23,9 @@ from sceneprior.core.furniture import (
     tidy_category,
 )
 from sceneprior.core.ground_truth import model_path, read_model
-from sceneprior.core.scene import Mesh
+from sceneprior.core.scene import Mesh, Textured
 from sceneprior.core.shards import INDEX_NAME, iterate_rooms
-from sceneprior.render.scene_files import glb_meshes
+from sceneprior.render.model_files import joined, load_parts
 
 OWN_FORMATS = (".glb", ".obj")
 
@@ -41,6 +39,8 @@ class ModelFiles:
     labels: Mapping[str, str]
     """Class by model id; `void` if the label set has no class for it."""
     read: Callable[[Path], Mesh]
+    textured: Callable[[Path], tuple[Textured, ...]] = lambda path: ()
+    """Reads the parts of a model with their materials; none for models in class colours."""
     broken: Mapping[str, str] = field(default_factory=dict)
     """Ids that cannot be names of files, each with the reason."""
 
@@ -63,16 +63,19 @@ def find_models(folder: Path, label_set_name: str) -> ModelFiles:
         )
     categories = model_categories(folder, "--models")
     labels = {m: class_of_category(name, label_set_name) for m, name in categories.items()}
-    return _listed(labels, lambda model_id: folder / model_id / MODEL_FILE, read_obj)
+    return _listed(labels, lambda model_id: folder / model_id / MODEL_FILE, read_obj, read_textured)
 
 
 def _listed(
-    labels: Mapping[str, str], path_of: Callable[[str], Path], read: Callable[[Path], Mesh]
+    labels: Mapping[str, str],
+    path_of: Callable[[str], Path],
+    read: Callable[[Path], Mesh],
+    textured: Callable[[Path], tuple[Textured, ...]] = lambda path: (),
 ) -> ModelFiles:
     wanted = sorted(model_id for model_id, label in labels.items() if label != "void")
     broken = {m: f"{ascii(m)[:60]} cannot be a folder's name" for m in wanted if not is_name(m)}
     paths = {m: path_of(m) for m in wanted if m not in broken}
-    return ModelFiles(paths, labels, read, broken)
+    return ModelFiles(paths, labels, read, textured, broken)
 
 
 def _labels_of_shards(folder: Path, label_set_name: str) -> dict[str, str]:
@@ -125,7 +128,7 @@ def _own_models(folder: Path, label_set_name: str) -> ModelFiles:
             labels[model_id] = label
             if label != "void":
                 paths[model_id] = path
-    return ModelFiles(paths, labels, _read_own)
+    return ModelFiles(paths, labels, _read_own, read_textured)
 
 
 def class_of_folder(name: str, label_set_name: str) -> str | None:
@@ -168,12 +171,28 @@ def read_glb(path: Path) -> Mesh:
     """
     where = f"{path.parent.name}/{path.name}"
     try:
-        meshes = list(glb_meshes(path).values())
+        parts = list(load_parts(path, "glb", with_materials=False).values())
     except Exception as error:  # a damaged file raises almost anything in trimesh
         reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
         raise InputError(f"{where} cannot be read ({reason.rstrip('.')})") from None
-    if not meshes:
+    if not parts:
         raise InputError(f"{where} holds no usable triangles")
-    starts = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes)])
-    faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
-    return Mesh(np.concatenate([mesh.vertices_m for mesh in meshes]), np.concatenate(faces))
+    return joined(parts)
+
+
+def read_textured(path: Path) -> tuple[Textured, ...]:
+    """The parts of a GLB or an OBJ with their materials; none if no part has one.
+
+    Materials that cannot be read, such as those with a damaged image, are a warning.
+    """
+    try:
+        parts = tuple(load_parts(path, path.suffix[1:].lower()).values())
+    except Exception as error:  # a damaged file raises almost anything in trimesh
+        warnings.warn(
+            f"{path.parent.name}/{path.name} gets the colour of its class, because its materials "
+            f"cannot be read ({type(error).__name__}: {error}).",
+            InputWarning,
+            stacklevel=2,
+        )
+        return ()
+    return parts if any(part.material is not None for part in parts) else ()

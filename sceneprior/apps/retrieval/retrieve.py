@@ -53,7 +53,7 @@ class Retrieved(NamedTuple):
 
 
 def retrieve(scene: Scene, models: CadModels, keep: Collection[int] = ()) -> Scene:
-    """The scene with the mesh of the most similar CAD model in every box.
+    """The scene with the mesh and the materials of the most similar CAD model in every box.
 
     Objects have the turn of their model as their yaw (`SceneObject.turned`). `extra["retrieval"]`
     holds {"model_id", "turn_deg", "distance_m"} for each object, in the order of the objects. The
@@ -70,8 +70,12 @@ def retrieve(scene: Scene, models: CadModels, keep: Collection[int] = ()) -> Sce
         if row not in keep and (of_class := models.by_class.get(item.label)):
             best = most_similar(box, of_class)
             mesh = placed(models.load(best.model_id), box, best.turn_deg)
+            textured = tuple(
+                part._replace(mesh=placed(part.mesh, box, best.turn_deg))
+                for part in models.textured(best.model_id)
+            )
             turned = quarter_turned(box.size_m, best.turn_deg // 90)
-            objects.append(replace(box, mesh=mesh, turned=turned, solids=()))
+            objects.append(replace(box, mesh=mesh, turned=turned, solids=(), textured=textured))
             told = best._asdict() | {"distance_m": round(best.distance_m, 5)}
         else:
             objects.append(item if box is item else item.in_box(box.center_m, box.size_m))

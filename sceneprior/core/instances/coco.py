@@ -1,5 +1,6 @@
 """Reads the objects of one image from COCO's JSON: polygons and run-length encoded masks."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -49,19 +50,13 @@ class _Coco(BaseModel):
 def read_coco(path: Path) -> tuple[np.ndarray, dict[int, str]]:
     """Read the instance ids and their class names from a COCO JSON of a single image.
 
-    Where objects overlap, the one with fewer pixels is taken to be in front, like a cup on a table.
+    Objects may overlap (`paint`).
 
     Returns:
         (height, width) uint16, k + 1 for the k-th annotation, 0 for background; and class names by
         id.
     """
-    data = read_json(path)
-    if not isinstance(data, dict):
-        raise InputError(
-            f"{path} is {'a list of results' if isinstance(data, list) else shown(data)}, not a "
-            "COCO JSON of masks; expected an object with `images` (their sizes), `annotations` and "
-            "`categories`: put results under `annotations` and add the other two."
-        )
+    data = read_coco_json(path)
     coco = checked(_Coco, data, f"{path} is not a COCO JSON of masks")
     if len(coco.images) != 1:
         raise InputError(
@@ -71,15 +66,9 @@ def read_coco(path: Path) -> tuple[np.ndarray, dict[int, str]]:
     if not 0 < len(found) < LARGEST_ID:
         raise InputError(f"{path} has {len(found)} annotations; expected 1 to {LARGEST_ID - 1}.")
     size = coco.images[0].height, coco.images[0].width
-    if size[0] * size[1] > LARGEST_PIXELS:
-        raise InputError(
-            f"{path}: its image is said to have {_size(size)} pixels, more than "
-            f"{LARGEST_PIXELS / 1e6:.0f} million; write the masks of a smaller image."
-        )
+    check_size(size, str(path))
     names = {row.id: row.name for row in coco.categories}
-    classes = {}
-    ids = np.zeros(size, dtype=np.uint16)
-    pixels_of_front = np.full(size, np.iinfo(np.int32).max, dtype=np.int32)
+    classes, masks = {}, []
     for row, annotation in enumerate(found):
         where = f"{path}, annotation {row if annotation.id is None else shown(annotation.id)}"
         if annotation.category_id not in names:
@@ -87,14 +76,47 @@ def read_coco(path: Path) -> tuple[np.ndarray, dict[int, str]]:
                 f"{where}: category {shown(annotation.category_id)} is not among its categories."
             )
         classes[row + 1] = CROWD if annotation.iscrowd else names[annotation.category_id]
-        mask = _decoded(annotation.segmentation, size, where)
-        # Among equally large objects, the later one is in front.
-        mask &= (pixels := np.int32(mask.sum())) <= pixels_of_front
-        ids[mask], pixels_of_front[mask] = row + 1, pixels
-    return ids, classes
+        masks.append((row + 1, annotation.segmentation, where))
+    ids = paint(((k, decode(mask, size, where)) for k, mask, where in masks), size)
+    return ids.astype(np.uint16), classes
 
 
-def _decoded(segmentation: Any, size: tuple[int, int], where: str) -> np.ndarray:
+def read_coco_json(path: Path) -> dict[str, Any]:
+    """Read a JSON that is an object, as all COCO's files of annotations are."""
+    data = read_json(path)
+    if not isinstance(data, dict):
+        raise InputError(
+            f"{path} is {'a list of results' if isinstance(data, list) else shown(data)}, not a "
+            "COCO JSON of masks; expected an object with `images` (their sizes), `annotations` and "
+            "`categories`: put results under `annotations` and add the other two."
+        )
+    return data
+
+
+def check_size(size: tuple[int, int], where: str) -> None:
+    """Raise an `InputError` for a size, (height, width), whose masks would not fit in memory."""
+    if size[0] * size[1] > LARGEST_PIXELS:
+        raise InputError(
+            f"{where}: its image is said to have {_size(size)} pixels, more than "
+            f"{LARGEST_PIXELS / 1e6:.0f} million; write the masks of a smaller image."
+        )
+
+
+def paint(masks: Iterable[tuple[int, np.ndarray]], size: tuple[int, int]) -> np.ndarray:
+    """Image of ids, (height, width) int32, of (id, mask) pairs whose masks may overlap.
+
+    The mask with fewer pixels is in front, like a cup on a table; of equally large ones, the later.
+    """
+    ids = np.zeros(size, dtype=np.int32)
+    pixels_of_front = np.full(size, np.iinfo(np.int32).max, dtype=np.int32)
+    for number, mask in masks:
+        pixels = np.int32(mask.sum())
+        front = mask & (pixels <= pixels_of_front)
+        ids[front], pixels_of_front[front] = number, pixels
+    return ids
+
+
+def decode(segmentation: Any, size: tuple[int, int], where: str) -> np.ndarray:
     """Decode polygons or run lengths, compressed or not, to a mask, (height, width) bool."""
     try:
         if isinstance(segmentation, list):

@@ -42,8 +42,9 @@ def _pixels(path: Path, rgb: bool) -> np.ndarray:
             return np.asarray(picture)
     except InputError:
         raise
-    except (OSError, ValueError, SyntaxError, EOFError, zlib.error) as error:
-        raise InputError(f"{path} is damaged ({str(error)[:120]}).") from None
+    except (OSError, ValueError, SyntaxError, EOFError, MemoryError, zlib.error) as error:
+        why = str(error)[:120] or "a part of it is said to be too large for memory"
+        raise InputError(f"{path} is damaged ({why}).") from None
 
 
 def _open(path: Path, rgb: bool) -> Image.Image:

@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import re
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from sceneprior.core.classes import VOID, label_set
+from sceneprior.core.classes import STUFF, VOID, label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.instances.checked import plain
 
@@ -20,6 +21,11 @@ SHELL = frozenset(
 """Classes of parts of the room itself. They become background unless the label set contains them,
 because they surround the furniture and are assumed not to occlude it."""
 LARGEST_ID = 65_535
+_OTHER_NAMES = {"flooring": "floor", "rug": "floor", "carpet": "floor", "windowpane": "window"}
+_STUFF_NAME = re.compile(
+    r"(wall|door|window|ceiling|floor|flooring|rug|carpet|windowpane)"
+    r"(?: (?:wood|marble|stone|tile|brick|concrete|panel|blind|stuff|other|merged))*"
+)
 
 
 def read_class_table(path: Path) -> dict[int, str]:
@@ -106,19 +112,30 @@ def tidy(name: str) -> str:
     return " ".join(name.lower().replace("_", " ").replace("-", " ").split())
 
 
+def stuff_of(name: str) -> int:
+    """Index into `STUFF` of a class by its name, also as COCO and ADE20K spell it; 0 for others.
+
+    >>> [STUFF[stuff_of(name)] for name in ("Wall", "floor-other-merged", "rug", "floor lamp")]
+    ['wall', 'floor', 'floor', 'unknown']
+    """
+    found = _STUFF_NAME.fullmatch(tidy(name))
+    return STUFF.index(_OTHER_NAMES.get(found[1], found[1])) if found else 0
+
+
 class IdTable:
     """Maps values of masks to consecutive ids for `observe`.
 
-    The k-th instance of the table gets the id k + 1. Values that the table does not list get the id
-    after the last instance's; they are void, and may occlude objects. Classes outside the label set
-    become void, except those of `SHELL`, which become background. `of_id` is the result of
-    `read_class_table`, and `where` is the beginning of error messages.
+    The k-th instance of the table, `objects[k]`, gets the id k + 1. Values that the table does not
+    list get the id after the last instance's; they are void, and may occlude objects. Classes
+    outside the label set become void, except those of `SHELL` and `STUFF`, which become background.
+    `of_id` is the result of `read_class_table`, and `where` is the beginning of error messages.
     """
 
     def __init__(self, of_id: dict[int, str], label_set_name: str, where: str):
         names = {tidy(name): i for i, name in enumerate(label_set(label_set_name))}
-        shell = [key for key, name in of_id.items() if tidy(name) in SHELL - set(names)]
-        objects = sorted(set(of_id) - set(shell))
+        stuff = {key: stuff_of(name) for key, name in of_id.items() if tidy(name) not in names}
+        shell = [key for key in stuff if stuff[key] or tidy(of_id[key]) in SHELL]
+        self.objects = objects = sorted(set(of_id) - set(shell))
         indices = [names.get(tidy(of_id[key]), VOID) for key in objects]
         self.classes = np.array([*indices, VOID], dtype=np.int16)
         if not self.classes.any():
@@ -136,8 +153,14 @@ class IdTable:
         self._table[[0, *shell]] = 0
         self._table[objects] = np.arange(1, len(objects) + 1)
         self._listed = np.array([-1, 0, *of_id])
+        self._stuff = np.zeros(LARGEST_ID + 2, dtype=np.uint8)
+        self._stuff[list(stuff)] = list(stuff.values())
 
     def ids(self, values: np.ndarray) -> np.ndarray:
         """Convert values to ids, (H, W) uint32, and collect unlisted values in `unlisted`."""
         self.unlisted |= set(np.setdiff1d(values, self._listed).tolist())
         return self._table[values]
+
+    def stuff(self, values: np.ndarray) -> np.ndarray:
+        """Convert values to indices into `STUFF`, uint8; 0 for objects and unknown values."""
+        return self._stuff[values]

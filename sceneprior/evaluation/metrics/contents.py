@@ -91,7 +91,7 @@ def emptiness(scenes: Sequence[Scene]) -> str | None:
         return None
     return (
         f"{empty} of {len(scenes)} generated rooms are empty, so none of the other scores can be "
-        "trusted: train longer, and check that `samples/empty_share` falls (docs/cluster.md)."
+        "trusted: train longer."
     )
 
 

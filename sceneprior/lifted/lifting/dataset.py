@@ -22,6 +22,7 @@ from sceneprior.core.geometry.turns import turn_boxes
 from sceneprior.core.parts import filled_cells
 from sceneprior.core.shards import RoomViews, Shard, iterate_rooms
 from sceneprior.core.views import LiftedRooms
+from sceneprior.core.wall_lines import Wall, find_walls
 from sceneprior.lifted.lifting.lifted import HANGS_M, LiftedBoxes, RayPool, ShapeGrid
 from sceneprior.lifted.prototypes import Prototypes, choose_prototypes, turned_looks
 
@@ -29,6 +30,9 @@ VERSION = 1
 """Version of the cached boxes."""
 SHAPES_VERSION = 5
 """Version of the cached hulls and rays. Raise it, or `VERSION`, when the same views give others."""
+
+WALLS_VERSION = 1
+"""Version of the cached walls."""
 
 RAYS_KEPT = 1024
 """Rays per object from which shapes are found."""
@@ -69,6 +73,7 @@ class LiftedDataset(RoomDataset):
             for index, room in enumerate(rooms)
         ]
         key = _fingerprint(rooms, checksums, chosen)
+        self._walls_at = folder, split, key, chosen
         counts = [len(room.object_class) for room in rooms]
         self.boxes = _find_boxes(folder, split, key, counts, chosen)
         self.max_objects = max(counts)
@@ -150,6 +155,11 @@ class LiftedDataset(RoomDataset):
         parts = turned.T.split(self._counts.tolist())
         padded = torch.nn.utils.rnn.pad_sequence(list(parts), batch_first=True, padding_value=-1)
         self._looks = padded.transpose(1, 2).to(self._counts.device)
+
+    def walls(self) -> list[list[Wall]]:
+        """Walls of each room, found in its masks; none if its shard has no stuff. They are cached
+        as `lifted_walls_<split>.npz`."""
+        return _find_walls(*self._walls_at)
 
     def hulls(self) -> Bool[np.ndarray, "objects x y z"]:
         """The visual hulls of all objects, room after room; see `lift_shapes`."""
@@ -246,6 +256,27 @@ def _find_shapes(
 
     key = f"{key} {SHAPES_VERSION} {shape.cells} {shape.margin}"
     return _kept(folder / f"lifted_shapes_{split}.npz", key, find)
+
+
+def _find_walls(
+    folder: Path, split: str, key: str, chosen: Sequence[np.ndarray]
+) -> list[list[Wall]]:
+    def find() -> dict[str, np.ndarray]:
+        found = [
+            find_walls(shard.read_room(room_id, images=True), views)[0]
+            if shard.has_stuff(room_id)
+            else ()
+            for views, (shard, room_id) in zip(chosen, iterate_rooms(folder, split), strict=True)
+        ]
+        rows = [np.hstack(wall) for walls in found for wall in walls]
+        return {
+            "walls": np.array(rows).reshape(-1, 7),
+            "counts": np.array([len(walls) for walls in found]),
+        }
+
+    saved = _kept(folder / f"lifted_walls_{split}.npz", f"{key} {WALLS_VERSION}", find)
+    parts = np.split(saved["walls"], np.cumsum(saved["counts"])[:-1])
+    return [[Wall(row[:2], row[2:4], row[4:6], float(row[6])) for row in part] for part in parts]
 
 
 def _kept(path: Path, key: str, find: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:

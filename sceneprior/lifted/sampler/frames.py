@@ -14,18 +14,10 @@ from torch import Tensor
 from sceneprior.core.geometry.turns import QUARTERS, turn_boxes
 from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.prototypes import POSES, turned_looks
-from sceneprior.lifted.sampler.rooms import gaps_to_sides_m, rectangles_of
+from sceneprior.lifted.sampler.rooms import gaps_to_sides_m, own_sides, rectangles_of
 
 FURTHEST_M = 1.0
 """Length to which gaps to the sides of the rectangle are clipped before they are averaged."""
-
-
-def own_sides(looks: Int[Tensor, "*batch"]) -> Int[Tensor, "*batch 4"]:
-    """The side of the room at which each of the four sides of a look's prototype is; sides are 0 to
-    3 for low z, low x, high z, high x."""
-    pose, own = (looks % POSES).unsqueeze(-1), torch.arange(QUARTERS, device=looks.device)
-    # Mirroring (x reversed) comes before the turn, and reverses the direction of sides.
-    return (pose % QUARTERS + torch.where(pose >= QUARTERS, -own, own)) % QUARTERS
 
 
 def side_of(

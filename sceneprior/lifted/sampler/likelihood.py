@@ -1,5 +1,7 @@
 """Likelihood of rooms, in a random order of their objects: the sampler's training loss."""
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -32,6 +34,7 @@ def negative_log_likelihood(
     uniform = torch.rand(rooms.is_object.shape, generator=generator).to(rooms.boxes_m)
     rooms = rooms.take(large_first(rooms.object_class, sampler.footprints_m2, uniform))
     frame = Frame(frames_of(rooms, generator), symmetry)
+    rooms = replace(rooms, walls_m=None)
     tokens = sampler.tokens(rooms, frame.rectangle_m)
     counts = rooms.is_object.sum(dim=1)
     there = sampler.contents.before(rooms.object_class, rooms.is_object)

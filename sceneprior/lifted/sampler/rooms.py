@@ -1,5 +1,7 @@
 """Training rooms of the sampler: the lifted objects of each room, with their looks."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,8 +12,9 @@ from torch.nn.utils.rnn import pad_sequence
 
 from sceneprior.core.geometry.turns import QUARTERS, turn_boxes
 from sceneprior.core.views import RoomBoxes
+from sceneprior.core.wall_lines import Wall
 from sceneprior.lifted.lifting.dataset import LiftedDataset
-from sceneprior.lifted.prototypes import Prototypes, turned_looks
+from sceneprior.lifted.prototypes import POSES, Prototypes, turned_looks
 
 GRAZE_M = 0.05
 """Overlap along an axis up to which an intersection of lifted boxes is put down to their
@@ -22,6 +25,13 @@ LOOSELY = 2.0
 """Range of the random offset of log footprints in `large_first`."""
 FRAME_M = 0.15
 """Standard deviation of the normal distribution in `frames_of`."""
+SURE_M = 0.03
+"""Largest error of a wall that is a side of a training room's rectangle."""
+AT_WALL_M = 0.45
+"""Largest gap between furniture and a wall that is a side of the rectangle; drawn rooms with larger
+gaps are drawn again (`draw.py`)."""
+FACING = 0.98
+"""Smallest cosine between a wall's normal and the axis that its side lies on: 11 degrees."""
 PLAUSIBLE_SHARE = 0.2
 """Share of the training rooms with both classes in which the two must intersect for this to be
 considered intended. Lifted boxes of chairs intersect each other in a seventh of the rooms, true
@@ -73,6 +83,11 @@ class SamplerRooms:
             room_ids=self.plain_ids,
             looks=padded(looks),
         )
+        walls = [
+            _walls_of(*each)
+            for each in zip(lifted.walls(), rectangles_of(self.rooms).numpy(), strict=True)
+        ]
+        self.rooms = replace(self.rooms, walls_m=torch.tensor(walls, dtype=torch.float32))
         return self
 
     def __len__(self) -> int:
@@ -132,8 +147,33 @@ def rectangles_of(rooms: RoomBoxes) -> Float[Tensor, "rooms 4"]:
     return found.where(rooms.is_object.any(dim=1, keepdim=True), 0.0)
 
 
+def _walls_of(walls: Sequence[Wall], rectangle_m: np.ndarray) -> list[float]:
+    """One row of `RoomBoxes.walls_m`: at each side of the rectangle around the furniture, the
+    nearest wall that faces it and is opposite to a part of it."""
+    middle, half = rectangle_m[:2], rectangle_m[2:] / 2
+    found = []
+    for outwards in np.array([[0, -1], [-1, 0], [0, 1], [1, 0]]):
+        side_m = middle @ outwards + half @ abs(outwards)
+        near = []
+        for wall in walls:
+            if wall.error_m > SURE_M or wall.inward @ outwards > -FACING:
+                continue
+            ends = np.sort((np.stack([wall.start_m, wall.end_m]) - middle) @ (1 - abs(outwards)))
+            across = half @ (1 - abs(outwards))
+            wall_m = (wall.start_m + wall.end_m) @ outwards / 2
+            if (
+                ends[0] < across
+                and ends[1] > -across
+                and -GRAZE_M * 2 < wall_m - side_m < AT_WALL_M
+            ):
+                near.append(wall_m)
+        found.append(min(near, key=lambda wall_m: abs(wall_m - side_m), default=math.nan))
+    return found
+
+
 def frames_of(rooms: RoomBoxes, generator: torch.Generator) -> Float[Tensor, "rooms 4"]:
-    """`rectangles_of`, with each side moved outwards by the absolute value of a normal number.
+    """`rectangles_of`, with each side moved outwards: to the wall if it is known, otherwise by the
+    absolute value of a normal number.
 
     The exact extents would reveal when a room is complete, since the last object touches them, and
     sampled furniture never fits a rectangle exactly. So noise of standard deviation `FRAME_M` is
@@ -142,6 +182,10 @@ def frames_of(rooms: RoomBoxes, generator: torch.Generator) -> Float[Tensor, "ro
     rectangle_m = rectangles_of(rooms)
     out = FRAME_M * torch.randn(len(rectangle_m), 4, generator=generator).abs().to(rectangle_m)
     low, high = rectangle_sides(rectangle_m)
+    if rooms.walls_m is not None:
+        sides = torch.cat([-low, high], dim=-1)
+        gaps = (rooms.walls_m[:, [1, 0, 3, 2]] - sides).clamp(min=0)
+        out = gaps.where(gaps.isfinite(), out)
     low, high = low - out[:, :2], high + out[:, 2:]
     return torch.cat([(low + high) / 2, high - low], dim=-1)
 
@@ -181,7 +225,18 @@ def turned_rooms(rooms: RoomBoxes, symmetry: Int[Tensor, " rooms"]) -> RoomBoxes
         rooms,
         boxes_m=turn_boxes(rooms.boxes_m, quarters, mirrored),
         looks=turned_looks(rooms.looks, quarters, mirrored),
+        walls_m=None
+        if rooms.walls_m is None
+        else torch.zeros_like(rooms.walls_m).scatter(-1, own_sides(symmetry), rooms.walls_m),
     )
+
+
+def own_sides(looks: Int[Tensor, "*batch"]) -> Int[Tensor, "*batch 4"]:
+    """The side of the room at which each of the four sides of a look's prototype is; sides are 0 to
+    3 for low z, low x, high z, high x."""
+    pose, own = (looks % POSES).unsqueeze(-1), torch.arange(QUARTERS, device=looks.device)
+    # Mirroring (x reversed) comes before the turn, and reverses the direction of sides.
+    return (pose % QUARTERS + torch.where(pose >= QUARTERS, -own, own)) % QUARTERS
 
 
 def shuffled(rooms: RoomBoxes, generator: torch.Generator) -> RoomBoxes:

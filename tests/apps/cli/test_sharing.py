@@ -13,10 +13,8 @@ from sceneprior.apps.priors.where import shipped_priors
 from sceneprior.apps.rooms import write_scenes
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.interchange.export import FORMATS
-from sceneprior.render.offscreen import SoftwareRenderer
 
 BEDROOM = "front3d_bedroom"
-SOFT = ("--renderer", "software")
 
 
 @pytest.fixture
@@ -36,7 +34,7 @@ def test_scores_of_a_packed_prior_need_a_file_and_shards(command, packed, toy_sh
     assert "procthor-bedroom was trained on shards 'front_bedroom_large', which do not" in (
         one_sentence(command(*call))
     )
-    call = ["eval-fid", "--run", "mine.prior", "-n", 3, "--resamples", 0, *SOFT, "--out", "s.json"]
+    call = ["eval-fid", "--run", "mine.prior", "-n", 3, "--resamples", 0, "--out", "s.json"]
     status, _, errors = command(*call, "--shards", toy_shards)
     assert status == 0, errors
     assert json.loads((tmp_path / "s.json").read_text())["protocol"]["run"] == "mine.prior"
@@ -89,7 +87,7 @@ def test_priors_are_listed_and_their_cards_printed(command, packed, sampler_run)
 def test_export_goes_both_ways(command, tmp_path):
     bed = SceneObject("double_bed", (0.2, 0.3, -0.9), (1.7, 0.6, 2.1))
     rooms = [Scene(name, BEDROOM, (bed,)) for name in ("first", "second")]
-    write_scenes(rooms, tmp_path / "rooms", SoftwareRenderer())
+    write_scenes(rooms, tmp_path / "rooms")
     for to in FORMATS:
         status, out, errors = command("export", "rooms", "--to", to, "--out", to)
         assert (status, out) == (0, f"Wrote 2 rooms to {to}\n"), errors

@@ -10,10 +10,10 @@ from sceneprior.core.ground_truth import reference_scenes
 
 
 @pytest.fixture(scope="session")
-def scenes(toy_shards, renderer, tmp_path_factory) -> Path:
+def scenes(toy_shards, tmp_path_factory) -> Path:
     """Four training rooms as boxes, in a folder. Tests read it and write scores beside them."""
     folder = tmp_path_factory.mktemp("theirs") / "scenes"
     rooms = reference_scenes(toy_shards, "train", limit=4)
     plain = [replace(room.without_meshes(), name=f"room_{k}") for k, room in enumerate(rooms)]
-    write_scenes(plain, folder, renderer)
+    write_scenes(plain, folder)
     return folder

@@ -11,7 +11,7 @@ from sceneprior.apps.experiments.steps import StepRunner
 from sceneprior.core.errors import InputError
 from sceneprior.core.settings import find_config
 
-SETTINGS = ("demo.yaml", 20, 4, "auto")
+SETTINGS = ("demo.yaml", 20, 4)
 COMMANDS = ["make-homes", "prep-front", "fit", "synthesize", "eval-fid", "report"]
 
 
@@ -72,7 +72,7 @@ def test_what_follows_a_step_that_is_done_again_is_done_again(ran, tmp_path):
     # Scores of the former prior are there, and are not taken for the new one's.
     assert run(tmp_path, called) == ["synthesize", "eval-fid", "report"]
     assert run(tmp_path, called) == []
-    assert run(tmp_path, called, settings=("demo.yaml", 20, 5, "auto")) == ["eval-fid", "report"]
+    assert run(tmp_path, called, settings=("demo.yaml", 20, 5)) == ["eval-fid", "report"]
 
 
 def test_costs_add_up_over_a_stop_and_are_unknown_after_a_kill(ran, tmp_path):

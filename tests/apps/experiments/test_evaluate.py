@@ -1,4 +1,4 @@
-"""eval-fid from the command line: a run, the user's scenes, kept references, refusals."""
+"""eval-fid from the command line: a run, the user's scenes, refusals."""
 
 import json
 import re
@@ -23,24 +23,19 @@ from sceneprior.core.shards import iterate_rooms
 from sceneprior.core.views import DecodedScenes
 from sceneprior.evaluation.metrics.contents import category_kl, class_frequencies
 from sceneprior.paper.sampling import COPIES
-from sceneprior.render.offscreen import SoftwareRenderer
 from sceneprior.render.topdown import box_mesh
 
 
-def test_the_users_scenes_are_evaluated_and_again_with_the_reference(
-    command, scenes, toy_shards, tmp_path
-):
-    call = ["eval-fid", "--scenes", scenes, "--shards", toy_shards, "--renderer", "software"]
-    status, out, errors = command(*call, "--resamples", 20, "--reference", "reference.npz")
+def test_the_users_scenes_are_evaluated(command, scenes, toy_shards, tmp_path):
+    call = ["eval-fid", "--scenes", scenes, "--shards", toy_shards]
+    status, out, errors = command(*call, "--resamples", 20)
     assert status == 0, errors
     assert f"Wrote {scenes / 'scores.json'}" in out.replace("\n", "") and "4 rooms" in out
     first = json.loads((scenes / "scores.json").read_text())
     assert first["protocol"]["scenes"] == "scenes" and first["protocol"]["resamples"] == 20
     assert first["near_copy_share"] == 1 and first["out_of_bounds_share"] == 0
     # scores.json lies among the scenes now, and is none.
-    status, _, errors = command(
-        *call, "--resamples", 20, "--reference", "reference.npz", "--out", "b.json"
-    )
+    status, _, errors = command(*call, "--resamples", 20, "--out", "b.json")
     assert status == 0, errors
     assert json.loads((tmp_path / "b.json").read_text()) == first
     status, _, errors = command(*call, "-n", 2, "--seed", 3, "--resamples", 0, "--out", "c.json")
@@ -50,7 +45,7 @@ def test_the_users_scenes_are_evaluated_and_again_with_the_reference(
 
 
 def test_fewer_scenes_than_asked_for_are_a_sentence(command, scenes, toy_shards, tmp_path):
-    call = ["eval-fid", "--scenes", scenes, "--shards", toy_shards, "--renderer", "software"]
+    call = ["eval-fid", "--scenes", scenes, "--shards", toy_shards]
     status, _, errors = command(*call, "-n", 500, "--out", "s.json")
     assert status == 2 and not (tmp_path / "s.json").exists()
     assert errors == (
@@ -60,7 +55,7 @@ def test_fewer_scenes_than_asked_for_are_a_sentence(command, scenes, toy_shards,
 
 
 def test_scenes_have_a_page_with_their_scores(command, scenes, toy_shards, tmp_path):
-    given = ["--scenes", scenes, "--shards", toy_shards, "--renderer", "software"]
+    given = ["--scenes", scenes, "--shards", toy_shards]
     scored = tmp_path / "s.json"
     assert command("eval-fid", *given, "--resamples", 0, "--out", scored)[0] == 0
     call = ["report", *given, "--out", "page.html"]
@@ -92,7 +87,7 @@ def test_other_json_among_scenes_is_said(command, scenes, toy_shards, tmp_path):
     folder = shutil.copytree(scenes, tmp_path / "mixed")
     (folder / "cameras.json").write_text("[1, 2]")
     (folder / "room_9.json").write_text('{"objects": []}')
-    call = ["eval-fid", "--scenes", folder, "--shards", toy_shards, "--renderer", "software"]
+    call = ["eval-fid", "--scenes", folder, "--shards", toy_shards]
     status, _, errors = command(*call, "--resamples", 0)
     assert status == 0
     (said,) = (line for line in errors.splitlines() if "Warning: " in line)
@@ -106,7 +101,7 @@ def test_a_run_whose_rooms_are_copies_is_warned_of_wherever_it_draws(command, to
     shutil.copytree(toy_run, tmp_path / "run")
     config = tmp_path / "run" / "config.yaml"
     config.write_text(config.read_text().replace("distribution: paper", "distribution: kernel"))
-    soft = ["--run", "run", "--renderer", "software"]
+    soft = ["--run", "run"]
     way = ["interpolate", *soft, "--from", "seed:1", "--to", "seed:2", "--steps", 2, "--out", "way"]
     status, _, errors = command(*way)
     assert status == 0 and errors.count(f"Warning: {COPIES}\n") == 1, errors
@@ -123,7 +118,7 @@ def test_a_run_whose_rooms_are_copies_is_warned_of_wherever_it_draws(command, to
 
 
 def test_a_run_is_evaluated_with_its_own_shards(command, toy_run, tmp_path):
-    call = ["eval-fid", "--run", toy_run, "-n", 5, "--renderer", "software", "--out", "s.json"]
+    call = ["eval-fid", "--run", toy_run, "-n", 5, "--out", "s.json"]
     status, out, errors = command(*call, "--resamples", 5)
     assert status == 0, errors
     assert "5 rooms" in out and "nan" not in out.lower()
@@ -151,7 +146,7 @@ def test_a_run_is_evaluated_with_its_own_shards(command, toy_run, tmp_path):
     ],
 )
 def test_what_cannot_be_evaluated_is_one_sentence(command, tmp_path, arguments, sentence):
-    status, _, errors = command("eval-fid", *arguments, "--renderer", "software")
+    status, _, errors = command("eval-fid", *arguments)
     assert status == 2 and errors.startswith(f"Error: {sentence}"), errors
     assert len(errors.strip().splitlines()) == 1 and list(tmp_path.iterdir()) == []
 
@@ -167,7 +162,7 @@ def test_a_run_without_3d_truth_has_a_page_and_scores_from_views(
     shutil.copytree(toy_run, tmp_path / "run")
     config = tmp_path / "run" / "config.yaml"
     config.write_text(config.read_text().replace(str(toy_shards), str(tmp_path / "bare")))
-    status, _, errors = command("report", "--run", "run", "--renderer", "software")
+    status, _, errors = command("report", "--run", "run")
     assert status == 0, errors
     page = (tmp_path / "run" / "report.html").read_text()
     assert (
@@ -193,12 +188,12 @@ def test_a_run_without_3d_truth_has_a_page_and_scores_from_views(
     assert low <= scores["mean_objects"] <= high
     assert 0 < scores["mask_iou_training_views"] < 1
     assert scores["protocol"]["n_test"] == 4 and "known from views alone" in scores["note"]
-    status, _, errors = command("report", "--run", "run", "--renderer", "software")
+    status, _, errors = command("report", "--run", "run")
     page = (tmp_path / "run" / "report.html").read_text()
     assert "<h2>Scores</h2>" in page and "mean mask IoU in training views" in page
     (tmp_path / "run" / "scores.json").unlink()
     # Scenes of any method have scores from views, too.
-    write_scenes(made, tmp_path / "made", SoftwareRenderer())
+    write_scenes(made, tmp_path / "made")
     call = ["eval-fid", "--scenes", "made", "--shards", "bare", "--resamples", 0]
     assert command(*call)[0] == 0
     again = json.loads((tmp_path / "made" / "scores.json").read_text())
@@ -207,13 +202,13 @@ def test_a_run_without_3d_truth_has_a_page_and_scores_from_views(
     # Without a test split, too; the training rooms are compared with what they were.
     shutil.rmtree(tmp_path / "bare")
     shutil.copytree(toy_shards, tmp_path / "bare", ignore=shutil.ignore_patterns("test"))
-    status, _, errors = command("report", "--run", "run", "--renderer", "software")
+    status, _, errors = command("report", "--run", "run")
     assert status == 0, errors
     page = (tmp_path / "run" / "report.html").read_text()
     assert "<h2>New rooms</h2>" in page and "<h2>Decoded training rooms<" in page
     # Runs whose rooms are known still have to be evaluated first.
     config.write_text(config.read_text().replace(str(tmp_path / "bare"), str(toy_shards)))
-    status, _, errors = command("report", "--run", "run", "--renderer", "software")
+    status, _, errors = command("report", "--run", "run")
     assert status == 2 and "scores.json holds no scores" in errors
 
 

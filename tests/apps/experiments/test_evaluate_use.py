@@ -12,7 +12,6 @@ from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.scene_json import scene_to_json
 
-SOFT = ("--renderer", "software")
 FLOOR = np.array([[-2.0, -2], [2, -2], [2, 2], [-2, 2]])
 
 
@@ -83,7 +82,7 @@ def test_a_run_stands_beside_real_and_random_rooms(command, toy_run, toy_shards,
 
 
 def test_evaluate_holds_all_that_eval_fid_measures(command, toy_run, tmp_path):
-    both = ["--run", toy_run, "-n", 4, "--resamples", 0, *SOFT]
+    both = ["--run", toy_run, "-n", 4, "--resamples", 0]
     assert command("eval-fid", *both, "--out", "fid.json")[0] == 0
     status, printed, errors = command("evaluate", *both, "--settle", "none", "--out", "all.json")
     assert status == 0, errors
@@ -93,10 +92,7 @@ def test_evaluate_holds_all_that_eval_fid_measures(command, toy_run, tmp_path):
     assert every["protocol"]["n_train_rooms"] == fid["protocol"]["n_train_rooms"]
     assert "sceneeval_col_objects" in every and "SUPPORT" in printed and "Category KL" in printed
     # The report and its page take either file.
-    assert (
-        command("report", "--run", toy_run, "--scores", "all.json", "--out", "r.html", *SOFT)[0]
-        == 0
-    )
+    assert command("report", "--run", toy_run, "--scores", "all.json", "--out", "r.html")[0] == 0
     assert "SUPPORT: objects that rest" in (tmp_path / "r.html").read_text()
 
 

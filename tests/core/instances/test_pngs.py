@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageFile
 
 from sceneprior.core.errors import InputError
 from sceneprior.core.instances.pngs import mask_size, read_mask
@@ -63,4 +63,17 @@ def test_damage_is_a_sentence(path, rng):
     path.unlink()
     path.mkdir()
     with pytest.raises(InputError, match="is not a readable PNG"):
+        read_mask(path)
+
+
+def test_a_png_that_is_said_to_be_too_large_for_memory(tmp_path, monkeypatch):
+    """Pillow reads as many bytes as the length of a chunk says."""
+    path = tmp_path / "a.png"
+    Image.fromarray(np.zeros((4, 4), dtype=np.uint8)).save(path)
+
+    def load(picture):
+        raise MemoryError
+
+    monkeypatch.setattr(ImageFile.ImageFile, "load", load)
+    with pytest.raises(InputError, match=r"a\.png is damaged .a part of it is said to be too"):
         read_mask(path)

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from sceneprior.core.classes import STUFF
 from sceneprior.core.errors import InputError
-from sceneprior.core.instances.tables import IdTable, read_class_table
+from sceneprior.core.instances.tables import IdTable, read_class_table, stuff_of
 
 
 @pytest.mark.parametrize(
@@ -41,6 +42,31 @@ def test_values_become_ids_in_the_tables_order():
     np.testing.assert_array_equal(table.classes > 0, [True, False, False, False])
     assert table.unlisted == {4}
     assert table.notes == ["classes outside the label set are void: night_stand (1), teapot (1)"]
+
+
+@pytest.mark.parametrize(
+    ("name", "stuff"),
+    [
+        ("Wall", "wall"), ("wall-other-merged", "wall"), ("floor-wood", "floor"),
+        ("rug-merged", "floor"), ("carpet", "floor"), ("ceiling-merged", "ceiling"),
+        ("door-stuff", "door"), ("window-blind", "window"), ("windowpane", "window"),
+        ("floor lamp", "unknown"), ("wall cabinet", "unknown"), ("bed", "unknown"),
+        ("background", "unknown"), ("doormat", "unknown"),
+    ],
+)  # fmt: skip
+def test_stuff_has_names_of_public_data_sets(name, stuff):
+    assert STUFF[stuff_of(name)] == stuff
+
+
+def test_stuff_is_background_unless_the_label_set_has_its_class():
+    table = IdTable({1: "bed", 2: "rug", 3: "wall-wood", 4: "picture"}, "void,bed", "here")
+    values = np.array([0, 1, 2, 3, 4, 5, -1])
+    np.testing.assert_array_equal(table.ids(values), [0, 1, 0, 0, 0, 2, 2])
+    floor, wall = STUFF.index("floor"), STUFF.index("wall")
+    np.testing.assert_array_equal(table.stuff(values), [0, 0, floor, wall, 0, 0, 0])
+    own = IdTable({1: "bed", 2: "rug"}, "void,bed,rug", "here")
+    np.testing.assert_array_equal(own.ids(values[:3]), [0, 1, 2])
+    assert not own.stuff(values).any()
 
 
 def test_a_table_without_any_class_of_the_set():

@@ -7,6 +7,8 @@ from front_reading import only_room
 
 from data_prep.front.drawing import prepare_room
 from data_prep.front.recipe import load_recipe
+from sceneprior.core.classes import STUFF
+from sceneprior.core.shards import stuff_size, stuff_step, thinned, thinned_intrinsics
 from sceneprior.render.offscreen import SoftwareRenderer
 
 SMALL = ("views.image_size=[60, 80]", "views.min_object_pixels=20")
@@ -20,6 +22,8 @@ class CountingRenderer(SoftwareRenderer):
 
     def instance_ids_of_views(self, meshes, cameras, image_size):
         images = super().instance_ids_of_views(meshes, cameras, image_size)
+        if len(meshes) == len(STUFF) - 1:  # the room itself
+            return images
         start = sum(self.drawn)
         self.drawn.append(len(cameras))
         self.cameras += cameras
@@ -69,3 +73,28 @@ def test_the_room_and_the_seed_decide(room):
     eyes = -np.einsum("nji,nj->ni", one.world_to_camera[:, :3, :3], one.world_to_camera[:, :3, 3])
     assert eyes[:, 1].min() >= 1.4 - 1e-5 and eyes[:, 1].max() <= 1.8 + 1e-5
     assert one.image_size == (60, 80)
+
+
+def test_floor_and_walls_are_drawn_behind_furniture(room):
+    """Each pixel shows what its ray meets: the floor at y = 0, or the wall at z = -2."""
+    views, _ = prepare(room, SoftwareRenderer(), "views.image_size=[180, 480]")
+    step = stuff_step(views.image_size)
+    assert step == 2 and views.stuff.shape[1:] == stuff_size(views.image_size)
+    free = views.instance_ids[(..., *thinned(step))] == 0
+    assert not views.stuff[~free].any()
+    K = thinned_intrinsics(views.intrinsics[0], step)
+    seen = set()
+    for stuff, pose, is_free in zip(views.stuff, views.world_to_camera, free, strict=True):
+        eye = -pose[:3, :3].T @ pose[:3, 3]
+        for row, column in np.argwhere(is_free)[::97]:
+            ray = pose[:3, :3].T @ np.linalg.solve(K, [column + 0.5, row + 0.5, 1])
+            down, back = -eye[1] / ray[1], (-2 - eye[2]) / ray[2]
+            on_floor, on_wall = eye + down * ray, eye + back * ray
+            expected = "unknown"
+            if back > 0 and abs(on_wall[0]) < 2 and 0 < on_wall[1] < 2.6:
+                expected = "wall"
+            elif down > 0 and np.abs(on_floor[[0, 2]]).max() < 2:
+                expected = "floor"
+            assert STUFF[stuff[row, column]] == expected
+            seen.add(expected)
+    assert seen == {"floor", "wall", "unknown"}

@@ -6,7 +6,7 @@ from front_files import bedroom
 from front_jobs import front_job
 
 from data_prep.engine.build import build_shards
-from data_prep.inspection.pictures import AXES, BACKGROUND, draw_plan, draw_view
+from data_prep.inspection.pictures import AXES, BACKGROUND, FLOOR, WALL, draw_plan, draw_view
 from data_prep.inspection.projection import wire_pixels
 from sceneprior.core.geometry.corners import BOX_EDGES, box_corners
 from sceneprior.core.shards import Shard, list_shards
@@ -65,3 +65,8 @@ def test_the_plan_shows_every_piece_from_above(shard):
         x, _, z = truth.centers_m[k] + truth.sizes_m[k] * 0.3  # beside bar and name
         assert not (plan[round(180 + 75 * z), round(240 + 75 * x)] == BACKGROUND).all()
     assert (plan == AXES["x"]).all(axis=2).any() and (plan == AXES["z"]).all(axis=2).any()
+    # The floor is seen, and its only wall, at z = -2; both reach from x = -2 to 2.
+    assert (plan == FLOOR).all(axis=2).mean() > 0.1
+    rows, columns = np.nonzero((plan == WALL).all(axis=2))
+    assert len(rows) > 50 and np.abs(rows - (180 - 150)).max() <= 4
+    assert columns.min() >= 240 - 154 and columns.max() <= 240 + 154

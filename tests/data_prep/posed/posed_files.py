@@ -12,7 +12,8 @@ from scan_files import BOX_FACES
 
 from data_prep.engine.source import PreparedRoom
 from data_prep.inspection.projection import box_iou_2d, boxes_around, hull_of
-from data_prep.posed.transforms import read_recording
+from data_prep.posed.formats import read_formats
+from data_prep.posed.source import PosedSource
 from data_prep.posed.views import PosedSettings, prepare_posed
 from data_prep.upright import own_sides
 from sceneprior.core.shards import RoomViews
@@ -118,9 +119,12 @@ class PosedRoom:
         return self.folder / "instances" / f"frame_{view:05d}.png"
 
 
-def prepared(room: PosedRoom, label_set: str = SET, **settings: Any) -> PreparedRoom | None:
-    """The room on disk as views."""
-    return prepare_posed(read_recording(room.folder), label_set, PosedSettings(**settings))
+def prepared(
+    room: PosedRoom, label_set: str = SET, tools: Sequence[str] = (), **settings: Any
+) -> PreparedRoom | None:
+    """The room on disk as views; `tools` are values of `--from`."""
+    source = PosedSource(room.folder, label_set, formats=read_formats(tools))
+    return prepare_posed(*source.open(room.folder), PosedSettings(**settings))
 
 
 def in_room(room: PosedRoom, center: tuple[float, float] = (0.1, -0.2)) -> list[np.ndarray]:

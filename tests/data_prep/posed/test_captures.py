@@ -12,7 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from data_prep.posed.source import PosedSource
 from data_prep.posed.transforms import read_recording
+from sceneprior.core.classes import STUFF
 from sceneprior.core.errors import InputError
+from sceneprior.core.shards import stuff_step, thinned
 
 LENSES = {
     "OPENCV": {"k1": -0.2, "k2": 0.05, "p1": 0.001, "p2": -0.002},
@@ -328,6 +330,22 @@ def test_panoptic_masks_are_tracks_with_classes(room):
     assert "classes outside the label set are void: backpack (1)" in made.notes
     # Things stand against a wall, which is stuff and hides nothing.
     np.testing.assert_array_equal(made.views.sides_clear[:, ::-1], plain.sides_clear)
+    assert plain.stuff is None
+    ids = np.stack([room.ids(view) for view in range(len(room.poses))])
+    is_wall = (ids == 11)[:, *thinned(stuff_step((240, 320)))]
+    assert is_wall.any()
+    np.testing.assert_array_equal(made.views.stuff, STUFF.index("wall") * is_wall)
+
+
+def test_a_stuff_segment_of_several_classes_is_background(room):
+    def rename(data):
+        data["categories"].append({"id": 190, "name": "floor-other-merged", "isthing": 0})
+        for segment in data["annotations"][1]["segments_info"]:
+            if segment["id"] == SEGMENTS[11]:
+                segment["category_id"] = 190
+
+    write_panoptic(room, rename)
+    assert prepared(room).views.stuff is None
 
 
 @pytest.mark.parametrize(
@@ -335,7 +353,7 @@ def test_panoptic_masks_are_tracks_with_classes(room):
     [
         (
             lambda data: data["annotations"][1]["segments_info"][0].update(category_id=27),
-            r"segment 70001 is bed in 'frame_00000\.png', but backpack in 'frame_00001\.png'\. Ids",
+            r"segment 70001 is bed in 'frame_00000', but backpack in 'frame_00001'\. Ids",
         ),
         (
             lambda data: data["annotations"][0]["segments_info"][0].update(category_id=1),

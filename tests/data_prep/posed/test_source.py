@@ -74,7 +74,7 @@ def test_one_room_is_a_folder_of_rooms(source, rooms, tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"No folder at .*; prep-posed reads a folder of rooms"):
         find_rooms(tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match=r"holds no transforms\.json and no model of COLMAP"):
+    with pytest.raises(InputError, match=r"holds no poses of nerfstudio .*\(unpack \.zip and"):
         find_rooms(tmp_path / "empty")
 
 

@@ -118,7 +118,7 @@ def test_frames_that_cannot_be_used_are_counted(room):
     made = prepared(room)
     assert len(made.views.visible) == 9
     assert made.notes[:2] == (
-        "1 of 11 frames have no usable pose; skipped", "1 of 11 frames have no PNG; skipped",
+        "1 of 11 frames have no usable pose; skipped", "1 of 11 frames have no mask; skipped",
     )  # fmt: skip
     assert len(prepared(room, max_views=4).views.visible) == 4
 
@@ -194,7 +194,7 @@ def test_no_usable_frame(room):
         prepared(room)
     for view in range(2):
         room.png(view).unlink()
-    with pytest.raises(InputError, match=r"none of its 2 frames has a PNG of instance ids; expect"):
+    with pytest.raises(InputError, match=r"of its 2 frames has a mask; expected /.*_00000\.png\."):
         prepared(room)
 
 

@@ -1,19 +1,22 @@
 """Lifted rooms in batches: rows of the views, boxes and shapes found once."""
 
 import shutil
+from dataclasses import replace
 from itertools import islice
 
 import h5py
 import numpy as np
 import pytest
 import torch
+from rooms_of_walls import L_SHAPE, shell_room
 from toy_rooms import LABEL_SET, write_shard
 
 from sceneprior.core.classes import VOID
-from sceneprior.core.data.dataset import BLANK, ViewDataset
+from sceneprior.core.data.dataset import BLANK, ViewDataset, allowed_views
 from sceneprior.core.errors import ShardError
 from sceneprior.core.geometry.turns import turn_boxes, turn_grids
 from sceneprior.core.shards import iterate_rooms
+from sceneprior.core.wall_lines import find_walls
 from sceneprior.lifted.lifting import boxes, shapes
 from sceneprior.lifted.lifting import dataset as module
 from sceneprior.lifted.lifting.dataset import LiftedDataset
@@ -171,3 +174,20 @@ def test_a_read_only_folder_is_enough(shards, monkeypatch):
     monkeypatch.setattr(module, "write_whole", refuse)
     assert len(LiftedDataset(shards, "train").boxes) == 6
     assert not (shards / "lifted_train.npz").exists()
+
+
+def test_walls_are_found_once_in_the_views_that_training_uses(tmp_path, monkeypatch):
+    room = shell_room(
+        L_SHAPE, [(-1.0, 0.5), (-1.2, -0.8), (0.9, -0.7)], block=(0.5, -1.4, 1.5, -0.9)
+    )
+    bare = replace(room, room_id="bare", stuff=None)
+    write_shard(tmp_path / "train" / "a.h5", LABEL_SET, [(bare, None), (room, None)])
+    lifted = LiftedDataset(tmp_path, "train", view_fraction=0.5)
+    none, walls = lifted.walls()
+    assert not none and len(walls) >= 5
+    used = allowed_views(0, 1, len(room.visible), 0.5)
+    for mine, theirs in zip(walls, find_walls(room, used)[0], strict=True):
+        np.testing.assert_array_equal(np.hstack(mine), np.hstack(theirs))
+    monkeypatch.setattr(module, "find_walls", None)
+    again = LiftedDataset(tmp_path, "train", view_fraction=0.5).walls()[1]
+    np.testing.assert_array_equal([np.hstack(w) for w in again], [np.hstack(w) for w in walls])

@@ -1,6 +1,7 @@
 """Training data of the sampler: sets of lifted objects, turned and mirrored exactly."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,9 @@ import torch
 from rooms_of_boxes import CLASSES, lifted_rooms, sampler_rooms
 from torch.testing import assert_close
 
+from sceneprior.core.geometry.turns import turn_boxes
 from sceneprior.core.views import RoomBoxes
+from sceneprior.core.wall_lines import Wall
 from sceneprior.lifted.lifting.dataset import LiftedDataset
 from sceneprior.lifted.sampler.rooms import (
     FRAME_M,
@@ -76,6 +79,54 @@ def test_frames_hold_the_rectangle_and_a_little_more(rooms):
     out = torch.cat(outs)
     assert out.min() >= -1e-5
     assert_close(out.square().mean().sqrt().item(), FRAME_M, rtol=0.1, atol=0)
+
+
+def wall(start, end, inward, error_m=0.01):
+    return Wall(np.array(start), np.array(end), np.array(inward, dtype=float), error_m)
+
+
+def test_rectangles_end_at_walls_near_the_furniture():
+    lifted = lifted_rooms()
+    middle, extents = rectangles_of(sampler_rooms().rooms)[0].double().numpy().reshape(2, 2)
+    (x1, z1), (x2, z2) = middle - extents / 2, middle + extents / 2
+    lifted.its_walls[0] = [
+        wall((x1 - 0.3, z1), (x1 - 0.3, z2), (1, 0)),
+        wall((x1 - 0.1, z1), (x1 - 0.1, z2), (1, 0)),  # nearer
+        wall((x1 - 0.05, z2 + 0.1), (x1 - 0.05, z2 + 1), (1, 0)),  # beside the furniture
+        wall((x1 - 0.02, z1), (x1 - 0.02, z2), (-1, 0)),  # faces away
+        wall((x1, z1 + 0.02), (x2, z1 + 0.02), (0, 1)),  # cut by a badly lifted box
+        wall((x2 + 0.6, z1), (x2 + 0.6, z2), (-1, 0)),  # far
+        wall((x1, z2 + 0.2), (x2, z2 + 0.2), (0, -1), error_m=0.2),  # not sure
+    ]
+    rooms = with_looks(lifted).rooms
+    known = rooms.walls_m[0].isfinite().tolist()
+    assert known == [True, True, False, False]  # low z, low x, high z, high x
+    assert not rooms.walls_m[1:].isfinite().any()
+    for seed in range(3):
+        frames = frames_of(rooms, torch.Generator().manual_seed(seed))
+        low, high = rectangle_sides(frames[0].double())
+        assert_close(low, torch.tensor([x1 - 0.1, z1], dtype=torch.float64), rtol=0, atol=1e-6)
+        assert high[0] > x2 and high[1] > z2
+        plain = frames_of(replace(rooms, walls_m=None), torch.Generator().manual_seed(seed))
+        assert torch.equal(frames[1:], plain[1:])
+
+
+@pytest.mark.parametrize("symmetry", range(SYMMETRIES))
+def test_walls_turn_with_their_room(rooms, symmetry):
+    walls = torch.tensor([[1.0, 2.0, 3.0, math.nan]]).expand(len(rooms), 4)
+    turned = turned_rooms(replace(rooms.rooms, walls_m=walls), torch.full((len(rooms),), symmetry))
+    # Outwards of low z, low x, high z and high x; the last wall is unknown.
+    outwards = torch.tensor([[[0.0, 0, -1], [-1, 0, 0], [0, 0, 1]]])
+    boxes = torch.cat([outwards, torch.ones(1, 3, 3)], dim=-1)
+    quarters, mirrored = torch.tensor([symmetry % 4]), torch.tensor([symmetry >= 4])
+    for distance, way in zip(
+        (1.0, 2.0, 3.0), turn_boxes(boxes, quarters, mirrored)[0], strict=True
+    ):
+        side = {(0, -1): 0, (-1, 0): 1, (0, 1): 2, (1, 0): 3}[
+            round(way[0].item()), round(way[2].item())
+        ]
+        assert turned.walls_m[0, side] == distance
+    assert turned.walls_m.isnan().sum() == len(rooms)
 
 
 def test_gaps_to_the_sides_of_a_rectangle():

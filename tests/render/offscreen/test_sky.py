@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from sceneprior.core.scene import Mesh, Scene, SceneObject
-from sceneprior.render.offscreen import SoftwareRenderer
 from sceneprior.render.offscreen.cameras import Pinhole
 from sceneprior.render.offscreen.sky import DARKEST, sky_light
 from sceneprior.render.offscreen.zbuffer import rasterize
@@ -73,7 +72,7 @@ def test_pictures_have_shadows_and_are_the_same_each_time():
     scene = Scene(
         "a", "front3d_bedroom", (bed,), floor_m=np.array([[-2, -2], [2, -2], [2, 2], [-2, 2.0]])
     )
-    one, other = (perspective(scene, SoftwareRenderer(), SIZE) for _ in range(2))
+    one, other = (perspective(scene, SIZE) for _ in range(2))
     np.testing.assert_array_equal(one, other)
     floor = one.reshape(-1, 3)[(np.ptp(one.reshape(-1, 3), axis=1) < 20)]
     assert len(np.unique(floor.sum(axis=1))) > 5, "not one grey"

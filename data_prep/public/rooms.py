@@ -1,0 +1,164 @@
+"""Turns frames of instance ids with cameras and 3D boxes into a prepared room."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from data_prep.engine.source import PreparedRoom
+from data_prep.frames import (
+    FrameChoice,
+    choose_frames,
+    first_fault,
+    mask_intrinsics,
+    room_cameras,
+    sampled_lines,
+    shrunk,
+)
+from sceneprior.core.classes import label_set
+from sceneprior.core.errors import InputError
+from sceneprior.core.instances.observations import Observations, observe
+from sceneprior.core.instances.tables import IdTable, tidy
+from sceneprior.core.shards import RoomGroundTruth
+
+
+@dataclass(frozen=True)
+class FramedRoom:
+    """Frames of one room, in a right-handed world in metres whose y points up."""
+
+    ids: np.ndarray
+    """(views, height, width) int32: number of an object, 0 = background, -1 = unknown."""
+    classes: dict[int, str]
+    """Class of each object's number; a name outside the label set makes the object void."""
+    camera_to_world: np.ndarray
+    """(views, 4, 4) float64, OpenCV axes."""
+    intrinsics: np.ndarray
+    """(3, 3), or (views, 3, 3), in pixels of `ids`."""
+    boxes: dict[int, np.ndarray] = field(default_factory=dict)
+    """Lower and upper corner, (2, 3), of the axis-aligned box of objects, as far as known."""
+    floor_y: float | None = None
+    """Height of the floor; None takes the lowest point of the visible objects' boxes."""
+    floor_m: np.ndarray | None = None
+    """(P, 2) x, z of the floor's outline; None takes the rectangle around these boxes."""
+    ceiling_y: float | None = None
+    """Height of the ceiling; None takes the highest point of all boxes and cameras."""
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class FoundRoom:
+    """A room that a scene's folder holds."""
+
+    image_size: tuple[int, int]
+    """(height, width) of its images of ids, before they are shrunk."""
+    extra: dict[str, Any] = field(default_factory=dict)
+    """JSON values that reading the room needs (`RoomTask.extra`)."""
+
+
+def sampled(
+    size: tuple[int, int], max_side: int | None, intrinsics: np.ndarray
+) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
+    """Index that shrinks an image of this (height, width), and the intrinsics of the result."""
+    stored = shrunk(size, max_side)
+    lines = np.ix_(*(sampled_lines(*sides) for sides in zip(size, stored, strict=True)))
+    return lines, mask_intrinsics(intrinsics, size, size, stored)
+
+
+def chosen_frames(
+    where: str, camera_to_world: np.ndarray, with_mask: list[int], at_most: int
+) -> FrameChoice:
+    """Choose the frames that become views (`choose_frames`); an error if none is usable."""
+    choice = choose_frames(camera_to_world, with_mask, 1, at_most)
+    if not choice.frames:
+        bad = first_fault(camera_to_world)
+        fault = f"; frame {bad[0]}: {bad[1]}" if bad else ""
+        raise InputError(
+            f"{where} has no usable frame: {choice.bad_poses} of {choice.candidates} have no "
+            f"usable pose, {choice.without_mask} no image of ids{fault}. Download it again."
+        )
+    return choice
+
+
+def prepare_room(room_id: str, room: FramedRoom, label_set_name: str) -> PreparedRoom | None:
+    """Label the views of a room; None if no view shows an object of the label set.
+
+    The ground truth has the boxes of all objects with a class and a box. Without the box of a
+    visible object there is no ground truth.
+    """
+    names = {tidy(name) for name in label_set(label_set_name)} - {"void"}
+    if not names & {tidy(name) for name in room.classes.values()}:
+        return None
+    table = IdTable(room.classes, label_set_name, room_id)
+    seen = observe(table.ids(room.ids), table.classes)
+    if not len(seen.tracked):
+        return None
+    tracked = [table.objects[k] for k in seen.tracked]
+    boxes = np.array([room.boxes[k] for k in tracked if k in room.boxes]).reshape(-1, 2, 3)
+    eyes = room.camera_to_world[:, :3, 3]
+    floor_y = room.floor_y
+    if floor_y is None:
+        if not len(boxes):
+            raise InputError(f"{room_id}: no visible object has a 3D box, so the floor is unknown.")
+        floor_y = float(boxes[:, 0, 1].min())
+    if eyes[:, 1].min() <= floor_y:
+        raise InputError(
+            f"{room_id}: its lowest camera is at {eyes[:, 1].min():.2f} m, below the floor at "
+            f"{floor_y:.2f} m; poses and boxes do not belong together, or a file is damaged."
+        )
+    outline = room.floor_m
+    if outline is None:
+        ends = boxes.reshape(-1, 3) if len(boxes) else eyes
+        (x, z), (far_x, far_z) = ends[:, [0, 2]].min(axis=0), ends[:, [0, 2]].max(axis=0)
+        outline = np.array([(x, z), (far_x, z), (far_x, far_z), (x, far_z)])
+    center = (outline.min(axis=0) + outline.max(axis=0)) / 2
+    origin = np.array([center[0], floor_y, center[1]])
+    room_from_world = np.eye(4)
+    room_from_world[:3, 3] = -origin
+    world_to_camera = room_cameras(room.camera_to_world, room_from_world)
+    truth = None
+    if len(boxes) == len(tracked):
+        tops = [eyes[:, 1].max(), *(box[1, 1] for box in room.boxes.values())]
+        ceiling_y = max(tops) if room.ceiling_y is None else room.ceiling_y
+        truth = _truth(room, table, seen, origin, outline - center, float(ceiling_y - floor_y))
+    views = seen.room_views(room_id, world_to_camera, room.intrinsics)
+    notes = list(room.notes) + table.notes
+    if room.boxes and truth is None:
+        missing = len(tracked) - len(boxes)
+        notes.append(f"{missing} of {len(tracked)} objects have no 3D box: no ground truth")
+    return PreparedRoom(views, truth, notes=tuple(notes))
+
+
+def _truth(
+    room: FramedRoom, table: IdTable, seen: Observations, origin: np.ndarray, floor_m: np.ndarray,
+    height_m: float,
+) -> RoomGroundTruth:  # fmt: skip
+    """Ground truth of the objects with a box, the visible ones first; they have no meshes."""
+    unseen = [k for k in seen.unseen if k < len(table.objects) and table.objects[k] in room.boxes]
+    order = np.array([*seen.tracked, *unseen], dtype=np.int64)
+    corners = np.array([room.boxes[table.objects[k]] for k in order]) - origin
+    centers_m, sizes_m = corners.mean(axis=1), corners[:, 1] - corners[:, 0]
+    places = np.zeros((len(order), 4, 4))
+    places[:, range(3), range(3)] = sizes_m  # from the unit cube, for want of a model
+    places[:, :3, 3], places[:, 3, 3] = centers_m, 1
+    return RoomGroundTruth(
+        object_class=table.classes[order],
+        centers_m=centers_m.astype(np.float32),
+        sizes_m=sizes_m.astype(np.float32),
+        yaw_rad=np.zeros(len(order), dtype=np.float32),
+        model_ids=("",) * len(order),
+        model_to_room=places.astype(np.float32),
+        floor_m=floor_m.astype(np.float32),
+        height_m=height_m,
+    )
+
+
+def box_of(center: np.ndarray, axes: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """Lower and upper corner, (2, 3), of the axis-aligned box around an oriented box.
+
+    The rows of `axes` are the unit axes of the oriented box, `half` its half sizes along them.
+
+        >>> box_of(np.zeros(3), np.eye(3)[[2, 1, 0]], np.array([1.0, 2, 3])).tolist()
+        [[-3.0, -2.0, -1.0], [3.0, 2.0, 1.0]]
+    """
+    reach = np.abs(axes).T @ half
+    return np.stack([center - reach, center + reach])

@@ -1,0 +1,246 @@
+"""Finds the bases of walls and doors where masks of floor meet masks of walls, without depth.
+
+The floor is the plane y = 0, so a pixel on the lower edge of a wall is one point of the room.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from sceneprior.core.classes import STUFF
+from sceneprior.core.shards import RoomViews, stuff_step, thinned_intrinsics
+
+COARSE_M = 0.15
+"""Length on the floor of a pixel, along its ray, above which the pixel is not used."""
+NEAR_M = 0.1
+"""Largest distance of a point from its wall."""
+FACED = 0.4
+"""Sine of the angle with the wall at which some ray must meet each of its parts. Where a wall hides
+the floor beyond its corner, the border of the two runs along a ray, and is no wall."""
+SHORTEST_M = 0.3
+"""Length of the shortest visible part of a wall."""
+GAP_M = 0.3
+"""Longest hidden stretch within a part."""
+LEAST_VIEWS = 2
+"""A wall is found if at least so many views show it."""
+NARROWEST_M = 0.5
+"""Width of the narrowest door."""
+_DIRECTIONS, _OFFSET_M = 180, 0.04
+"""Directions of normals, and widths of offsets, among which walls are searched."""
+_MOST_LINES, _MOST_POINTS, _LEAST_POINTS = 24, 6000, 12
+_BIN_M = 0.05
+_ERROR_PX = 2.0
+"""Pixels by which a point may be off and still be one of a line that was found."""
+_PIXEL_ERROR_M = 0.01
+
+FLOOR, DOOR = STUFF.index("floor"), STUFF.index("door")
+BARRIER = np.isin(STUFF, ("wall", "door", "window"))
+"""True for the values of stuff that stand on the floor and hide what is behind them."""
+
+
+class Wall(NamedTuple):
+    """A visible part of the base of a wall, door or window; (x, z) in metres."""
+
+    start_m: Float[np.ndarray, "2"]
+    end_m: Float[np.ndarray, "2"]
+    inward: Float[np.ndarray, "2"]
+    """Unit normal, into the room."""
+    error_m: float
+    """Standard error of the wall's offset along its normal, by the differences between views."""
+
+
+class Door(NamedTuple):
+    """The base of a door; (x, z) in metres."""
+
+    start_m: Float[np.ndarray, "2"]
+    end_m: Float[np.ndarray, "2"]
+
+
+class _Edges(NamedTuple):
+    """Points at which floor meets a wall, a door or a window."""
+
+    points_m: Float[np.ndarray, "points 2"]
+    towards_camera: Float[np.ndarray, "points 2"]
+    weight: Float[np.ndarray, " points"]
+    """Inverse square of the pixel's length on the floor, to which errors of poses and masks are
+    proportional."""
+    view: Int[np.ndarray, " points"]
+    is_door: Bool[np.ndarray, " points"]
+
+    def take(self, which: np.ndarray | slice) -> "_Edges":
+        return _Edges(*(part[which] for part in self))
+
+
+class _Line(NamedTuple):
+    """Points p with p @ normal == offset_m; the normal points into the room."""
+
+    normal: Float[np.ndarray, "2"]
+    offset_m: float
+
+    def has(self, edges: _Edges, pixels: float = 0.0) -> Bool[np.ndarray, " points"]:
+        """True for points that face the line, within `NEAR_M` and so many pixels along their
+        ray."""
+        facing = edges.towards_camera @ self.normal
+        within_m = NEAR_M + pixels * edges.weight**-0.5 * facing
+        near = np.abs(edges.points_m @ self.normal - self.offset_m) < within_m
+        return near & (facing > 0)
+
+
+def find_walls(
+    room: RoomViews, views: Sequence[int] | np.ndarray | None = None
+) -> tuple[tuple[Wall, ...], tuple[Door, ...]]:
+    """Find the bases of walls and doors that some `views`, or all, of a room with `stuff` show.
+
+    Lines are found one after another, each where most points lie (a Hough transform), and fitted to
+    the points near them. Walls may have any direction.
+    """
+    edges = _edges(room, range(len(room.world_to_camera)) if views is None else views)
+    edges = edges.take(slice(None, None, max(1, len(edges.view) // _MOST_POINTS)))
+    walls: list[Wall] = []
+    doors: list[Door] = []
+    for _ in range(_MOST_LINES):
+        if len(edges.view) < _LEAST_POINTS:
+            break
+        line = _fitted(edges, _most_voted(edges))
+        on = line.has(edges)
+        walls += _parts(edges.take(on), line)
+        doors += _doors(edges.take(on), line)
+        edges = edges.take(~line.has(edges, _ERROR_PX))
+    return tuple(walls), tuple(doors)
+
+
+def _edges(room: RoomViews, views: Sequence[int] | np.ndarray) -> _Edges:
+    """Collect the points of some views."""
+    parts = [_edges_of_view(room, int(view)) for view in views]
+    return _Edges(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+
+def _edges_of_view(room: RoomViews, view: int) -> _Edges:
+    assert room.stuff is not None
+    pose = room.world_to_camera[view].astype(np.float64)
+    K = thinned_intrinsics(room.intrinsics[view], stuff_step(room.image_size))
+    image, up = room.stuff[view], pose[:2, 1]
+    # Turned by quarter turns, so that the room's up direction is the image's, up to 45 degrees.
+    sideways = abs(up[0]) > abs(up[1])
+    upside_down = up[0 if sideways else 1] > 0
+    image = image.T if sideways else image
+    image = image[::-1] if upside_down else image
+    rows, columns = np.nonzero((image[1:] == FLOOR) & BARRIER[image[:-1]])
+    kinds = image[rows, columns]
+    along = len(image) - rows - 1 if upside_down else rows + 1
+    # The base is at the boundary of the two pixels.
+    pixels = np.stack([columns + 0.5, along], axis=1)[:, :: -1 if sideways else 1]
+    points_m, length_m, towards = on_floor(pixels, pose, K)
+    near = length_m < COARSE_M
+    return _Edges(
+        points_m[near], towards[near], length_m[near] ** -2, np.full(near.sum(), view),
+        kinds[near] == DOOR,
+    )  # fmt: skip
+
+
+def on_floor(
+    pixels: Float[np.ndarray, "points 2"],
+    world_to_camera: Float[np.ndarray, "4 4"],
+    intrinsics: Float[np.ndarray, "3 3"],
+) -> tuple[
+    Float[np.ndarray, "points 2"], Float[np.ndarray, " points"], Float[np.ndarray, "points 2"]
+]:
+    """Points (x, z) at which the rays through pixels meet y = 0, the length in metres along the ray
+    that one pixel covers there (inf above the horizon), and unit vectors to below the camera."""
+    turn = world_to_camera[:3, :3]
+    eye = -turn.T @ world_to_camera[:3, 3]
+    focal = intrinsics[[0, 1], [0, 1]]
+    across = (pixels - intrinsics[:2, 2]) / focal
+    rays = np.concatenate([across, np.ones((len(across), 1))], axis=1) @ turn
+    down = np.maximum(-rays[:, 1], 1e-9)
+    reach = rays[:, ::2] * (eye[1] / down)[:, None]
+    distance = np.linalg.norm(reach, axis=1)
+    meets = (rays[:, 1] < 0) & (eye[1] > 0)
+    length = np.where(meets, (eye[1] ** 2 + distance**2) / max(eye[1], 1e-9) / focal.mean(), np.inf)
+    return eye[::2] + reach, length, -reach / np.maximum(distance, 1e-9)[:, None]
+
+
+def _most_voted(edges: _Edges) -> _Line:
+    angles = np.arange(_DIRECTIONS) * (2 * np.pi / _DIRECTIONS)
+    normals = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    offsets = edges.points_m @ normals.T
+    bins = np.floor((offsets - offsets.min()) / _OFFSET_M).astype(np.int64)
+    count = int(bins.max()) + 2
+    facing = edges.towards_camera @ normals.T > 0
+    votes = np.bincount(
+        (bins + count * np.arange(_DIRECTIONS))[facing],
+        np.broadcast_to(edges.weight[:, None], facing.shape)[facing],
+        count * _DIRECTIONS,
+    )
+    votes[:-1] += votes[1:]  # a wall may lie between two bins
+    direction, place = divmod(int(votes.argmax()), count)
+    return _Line(normals[direction], float(offsets.min() + (place + 1) * _OFFSET_M))
+
+
+def _fitted(edges: _Edges, line: _Line) -> _Line:
+    """Fit a line to the points near it, by weighted least squares of their distances."""
+    for _ in range(3):
+        near = edges.take(line.has(edges))
+        if len(near.view) < _LEAST_POINTS:
+            break
+        middle = np.average(near.points_m, axis=0, weights=near.weight)
+        apart = (near.points_m - middle) * near.weight[:, None] ** 0.5
+        normal = np.linalg.svd(apart.T @ apart)[0][:, 1]
+        normal = normal * np.sign(normal @ line.normal)
+        line = _Line(normal, float(middle @ normal))
+    return line
+
+
+def _runs(along_m: Float[np.ndarray, " points"]) -> list[Int[np.ndarray, " run"]]:
+    """Split points along a line where there is a gap; indices of the points of each part."""
+    order = np.argsort(along_m, kind="stable")
+    if not len(order):
+        return []
+    return np.split(order, np.flatnonzero(np.diff(along_m[order]) > GAP_M) + 1)
+
+
+def _parts(on: _Edges, line: _Line) -> list[Wall]:
+    found = []
+    along = np.array([-line.normal[1], line.normal[0]])
+    along_m = on.points_m @ along
+    for run in _runs(along_m):
+        ends = along_m[run].min(), along_m[run].max()
+        part = on.take(run)
+        views = np.unique(part.view)
+        faced = (part.towards_camera @ line.normal).max() > FACED
+        if not faced or len(views) < LEAST_VIEWS or ends[1] - ends[0] < SHORTEST_M:
+            continue
+        off = part.points_m @ line.normal - line.offset_m
+        weights = np.array([part.weight[part.view == view].sum() for view in views])
+        means = np.array(
+            [np.average(off[part.view == v], weights=part.weight[part.view == v]) for v in views]
+        )
+        spread = weights**2 @ (
+            (means - np.average(means, weights=weights)) ** 2 + _PIXEL_ERROR_M**2
+        )
+        error = spread**0.5 / weights.sum()
+        start, end = (end * along + line.offset_m * line.normal for end in ends)
+        found.append(Wall(start, end, line.normal, float(error)))
+    return found
+
+
+def _doors(on: _Edges, line: _Line) -> list[Door]:
+    """Doors: stretches of the line along which most points are on doors."""
+    along = np.array([-line.normal[1], line.normal[0]])
+    along_m = on.points_m @ along
+    first = along_m.min(initial=0.0)
+    bins = np.floor((along_m - first) / _BIN_M).astype(np.int64)
+    count = int(bins.max(initial=0)) + 1
+    doors, others = (
+        np.bincount(bins[which], minlength=count) for which in (on.is_door, ~on.is_door)
+    )
+    is_door = on.is_door & (doors > others)[bins]
+    found = []
+    for run in _runs(along_m[is_door]):
+        ends = along_m[is_door][run].min(), along_m[is_door][run].max()
+        views = np.unique(on.view[is_door][run])
+        if len(views) >= LEAST_VIEWS and ends[1] - ends[0] >= NARROWEST_M:
+            found.append(Door(*(end * along + line.offset_m * line.normal for end in ends)))
+    return found

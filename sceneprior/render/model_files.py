@@ -1,0 +1,110 @@
+"""GLBs and OBJs with their materials, as parts that have one material each."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sceneprior.core.scene import Mesh, Textured, mesh_of_file
+from sceneprior.render.topdown import linear_rgba
+
+LARGEST_PX = 1024
+"""Longest side of a texture; larger ones are scaled down, so that the files of rooms stay small."""
+TEXTURES = (
+    "baseColorTexture", "emissiveTexture", "normalTexture", "occlusionTexture",
+    "metallicRoughnessTexture",
+)  # fmt: skip
+"""The images of a material."""
+
+
+def load_parts(
+    path: Path, file_type: str | None = None, with_materials: bool = True
+) -> dict[str, Textured]:
+    """The meshes of a GLB or an OBJ by node name, placed by their nodes.
+
+    A damaged file raises any exception.
+
+    Args:
+        file_type: Format of the file; None for that of its suffix.
+    """
+    import trimesh
+
+    # process=False keeps vertices and faces as written.
+    loaded = trimesh.load_scene(
+        Path(path), file_type=file_type, process=False, skip_materials=not with_materials
+    )
+    parts = {}
+    for node in loaded.graph.nodes_geometry:
+        transform, name = loaded.graph[node]
+        mesh = loaded.geometry[name]
+        vertices = np.asarray(mesh.vertices, dtype=np.float64)
+        placed = mesh_of_file(vertices @ transform[:3, :3].T + transform[:3, 3], mesh.faces)
+        parts[node] = Textured(placed, *(_surface(mesh.visual) if with_materials else ()))
+    return parts
+
+
+def joined(parts: Iterable[Textured]) -> Mesh:
+    """One mesh of all parts, without the seams of textures, along which files repeat vertices, so
+    that closed meshes are open."""
+    meshes = [_without_seams(part.mesh) for part in parts]
+    starts = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes)])
+    faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
+    vertices = np.concatenate([mesh.vertices_m for mesh in meshes])
+    return _without_seams(Mesh(vertices, np.concatenate(faces)))
+
+
+def _without_seams(mesh: Mesh) -> Mesh:
+    """The mesh with equal vertices merged where edges have one face only. Other equal vertices stay
+    apart, since they may belong to closed solids that touch."""
+    faces = np.asarray(mesh.faces)
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    edges, sharing = np.unique(edges, axis=0, return_counts=True)
+    on_seam = np.unique(edges[sharing == 1])
+    _, first, same = np.unique(
+        mesh.vertices_m[on_seam], axis=0, return_index=True, return_inverse=True
+    )
+    merged = np.arange(len(mesh.vertices_m))
+    merged[on_seam] = on_seam[first[same.reshape(-1)]]
+    used, merged_faces = np.unique(merged[faces], return_inverse=True)
+    return Mesh(mesh.vertices_m[used], merged_faces.reshape(-1, 3))
+
+
+def _surface(visual: Any) -> tuple[Any, np.ndarray | None]:
+    """The material of a visual of trimesh, and texture coordinates if it has images; (None, None)
+    if the file defines none."""
+    from trimesh.visual.material import PBRMaterial, SimpleMaterial
+
+    material = getattr(visual, "material", None)
+    if isinstance(material, SimpleMaterial):
+        image, color = material.image, material.kwargs.get("kd")
+        # trimesh makes up a material, with an image of 2 x 2 pixels, where an OBJ names none.
+        image = image if image is not None and max(image.size) > 2 else None
+        if color is None and image is None:
+            return None, None
+        kd = np.full(3, 1.0) if color is None else np.clip(np.asarray(color, dtype=float), 0, 1)
+        material = PBRMaterial(
+            name=material.name, baseColorTexture=image, metallicFactor=0.0, roughnessFactor=0.9,
+            baseColorFactor=linear_rgba(np.round(255 * kd).astype(np.uint8)), doubleSided=True,
+        )  # fmt: skip
+    if not isinstance(material, PBRMaterial):
+        return None, None
+    uv = None if visual.uv is None else np.asarray(visual.uv, dtype=np.float64)
+    if uv is not None and not np.isfinite(uv).all():
+        uv = None
+    images = {name: getattr(material, name) for name in TEXTURES}
+    shown = {name: image for name, image in images.items() if image is not None and uv is not None}
+    for name in images:
+        setattr(material, name, _small(shown[name]) if name in shown else None)
+    return material, uv if shown else None
+
+
+def _small(image: Any) -> Any:
+    """A texture with at most `LARGEST_PX` pixels along each side, in colours that PNG has."""
+    image.load()  # a damaged image is an error here, not when a room is written
+    if image.mode not in ("L", "RGB", "RGBA"):
+        image = image.convert("RGBA" if "transparency" in image.info else "RGB")
+    if max(image.size) > LARGEST_PX:
+        image = image.copy()
+        image.thumbnail((LARGEST_PX, LARGEST_PX))
+    return image

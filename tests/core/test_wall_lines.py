@@ -1,0 +1,94 @@
+"""Walls and doors found where masks of floor and walls meet."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import shapely
+from rooms_of_walls import DOOR, L_SHAPE, shell_room
+
+from sceneprior.core.classes import STUFF
+from sceneprior.core.wall_lines import COARSE_M, find_walls, on_floor
+
+EYES = [(-1.0, 0.5), (-1.2, -0.8), (0.9, -0.7)]
+TURNED = [(1.2 * x - 0.5 * z, 0.5 * x + 1.2 * z) for x, z in L_SHAPE]
+
+
+def distance(points, outline):
+    """Largest distance of points from an outline."""
+    return shapely.distance(shapely.LinearRing(outline), shapely.points(points)).max()
+
+
+def ends_of(lines):
+    return np.concatenate([[line.start_m, line.end_m] for line in lines])
+
+
+@pytest.mark.parametrize("roll", range(4))
+def test_every_wall_of_an_l_shape_is_found_however_the_camera_is_rolled(roll):
+    walls, doors = find_walls(shell_room(L_SHAPE, EYES, roll=roll))
+    assert distance(ends_of(walls), L_SHAPE) < 0.03
+    found = shapely.union_all([shapely.LineString([w.start_m, w.end_m]) for w in walls])
+    outline = shapely.LinearRing(L_SHAPE)
+    assert outline.intersection(found.buffer(0.03)).length > 0.95 * outline.length
+    floor = shapely.Polygon(L_SHAPE)
+    for wall in walls:
+        inside = (wall.start_m + wall.end_m) / 2 + 0.1 * wall.inward
+        assert floor.contains(shapely.Point(inside)) and wall.error_m < 0.01
+    (door,) = doors
+    np.testing.assert_allclose(sorted(ends_of([door]).tolist()), sorted(DOOR), atol=0.06)
+
+
+def test_walls_may_have_any_direction():
+    eyes = [(1.2 * x - 0.5 * z, 0.5 * x + 1.2 * z) for x, z in EYES]
+    walls, _ = find_walls(shell_room(TURNED, eyes))
+    assert len(walls) >= 6 and distance(ends_of(walls), TURNED) < 0.07
+
+
+def test_a_wall_behind_furniture_has_parts():
+    room = [(-2.0, -1.5), (2.0, -1.5), (2.0, 1.5), (-2.0, 1.5)]
+    walls, _ = find_walls(shell_room(room, EYES, block=(-0.4, 1.0, 0.6, 1.5)))
+    upper = sorted(tuple(sorted((w.start_m[0], w.end_m[0]))) for w in walls if w.inward[1] < -0.9)
+    (left, near), (far, right) = upper
+    np.testing.assert_allclose((near, far), (-0.4, 0.6), atol=0.05)
+    np.testing.assert_allclose((left, right), (-2.0, 2.0), atol=0.2)  # corners are far away
+
+
+def test_wrong_poses_move_walls_little():
+    rng = np.random.default_rng(0)
+    room = shell_room(L_SHAPE, EYES)
+    moves = np.tile(np.eye(4), (len(room.stuff), 1, 1))
+    moves[:, :3, 3] = 0.02 * rng.normal(size=(len(moves), 3))
+    walls, _ = find_walls(replace(room, world_to_camera=moves @ room.world_to_camera))
+    assert distance(ends_of(walls), L_SHAPE) < 0.1
+    long = [w for w in walls if np.linalg.norm(w.end_m - w.start_m) > 1]
+    middles = [(w.start_m + w.end_m) / 2 for w in long]
+    assert len(long) >= 5 and distance(middles, L_SHAPE) < 0.03
+
+
+def test_one_view_or_no_floor_finds_no_wall():
+    room = shell_room(L_SHAPE, EYES)
+    assert find_walls(room, [3]) == ((), ())
+    assert find_walls(room, [3, 11])[0]
+    blank = np.where(room.stuff == STUFF.index("floor"), 0, room.stuff)
+    assert find_walls(replace(room, stuff=blank)) == ((), ())
+
+
+def test_points_on_the_floor_project_onto_their_pixels():
+    room = shell_room(L_SHAPE, EYES)
+    rng = np.random.default_rng(0)
+    pixels = rng.uniform((0, 0), room.image_size[::-1], (50, 2))
+    pose, K = room.world_to_camera[1].astype(float), room.intrinsics[1].astype(float)
+    points_m, length_m, towards = on_floor(pixels, pose, K)
+    eye = -pose[:3, :3].T @ pose[:3, 3]
+    below = np.isfinite(length_m)
+    assert 10 < below.sum() < 50
+    for pixel, (x, z), length, way in zip(
+        pixels[below], points_m[below], length_m[below], towards[below], strict=True
+    ):
+        u, v, depth = K @ (pose @ [x, 0, z, 1])[:3]
+        np.testing.assert_allclose([u / depth, v / depth], pixel, atol=1e-3)  # a float32 rotation
+        assert way @ (eye[::2] - (x, z)) == pytest.approx(np.hypot(*(eye[::2] - (x, z))))
+        # A pixel further along the ray's direction on the floor.
+        if length < COARSE_M and abs(pixel[0] - K[0, 2]) < 5:
+            (further,), _, _ = on_floor(pixel[None] - [[0, 0.01]], pose, K)
+            assert np.hypot(*(further - (x, z))) == pytest.approx(0.01 * length, rel=0.3)
