@@ -13,12 +13,15 @@ from sceneprior.core.shards import RoomViews
 _LEAST_VIEWS = 5
 """Views from which on the order of frames can be compared."""
 
+_SAME_FLOOR_M = 0.1
+
 
 class Evidence(NamedTuple):
     """Evidence of one room."""
 
     sums: dict[Cause, float]
     """Agreement of middles with cameras (`fit`), summed, after the correction of each cause."""
+    rooms: int
     middles: int
     spare: int
     """Middles beyond those that the objects' points take."""
@@ -59,7 +62,7 @@ def room_evidence(views: RoomViews, convention: Convention, floor: bool = True) 
     shown = views.visible.sum(axis=0)
     x, y, z = (-turns[:, 1]).mean(axis=0).tolist()
     return Evidence(
-        sums, len(found.item), found.spare, len(views.visible), int((shown > 0).sum()),
+        sums, 1, len(found.item), found.spare, len(views.visible), int((shown > 0).sum()),
         int(shown.sum()), int((shown == 1).sum()), _nearness(views), (x, y, z),
         float(np.median(eyes[:, 1])), _length(found, depth[0], lenses),
         None if level is None else level[0],
@@ -70,7 +73,7 @@ def total(rooms: list[Evidence]) -> Evidence:
     """Evidence of several rooms together: sums of counts, medians or means of the others."""
     causes = {cause: None for room in rooms for cause in room.sums}
     sums = {cause: sum(room.sums.get(cause, 0.0) for room in rooms) for cause in causes}
-    names = ("middles", "spare", "views", "ids", "masks", "once")
+    names = ("rooms", "middles", "spare", "views", "ids", "masks", "once")
     counts = {name: sum(getattr(room, name) for room in rooms) for name in names}
     x, y, z = np.mean([room.tops for room in rooms], axis=0).tolist()
     nearness, length, floor = (
@@ -84,8 +87,17 @@ def total(rooms: list[Evidence]) -> Evidence:
         tops=(x, y, z),
         eye_m=float(np.median([room.eye_m for room in rooms])),
         length_m=float(np.median(length)) if length else None,
-        floor_m=float(np.median(floor)) if 2 * len(floor) > len(rooms) else None,
+        floor_m=_usual(floor, len(rooms)),
     )
+
+
+def _usual(floors: list[float], rooms: int) -> float | None:
+    """Median height of the floors found; None if few are found, or if they differ."""
+    if not floors:
+        return None
+    middle = float(np.median(floors))
+    same = sum(abs(floor - middle) < _SAME_FLOOR_M for floor in floors)
+    return middle if same >= min(rooms, 2) and 3 * same >= 2 * len(floors) else None
 
 
 def _nearness(views: RoomViews) -> float | None:

@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from data_prep.engine.report import REPORT_NAME
+from data_prep.engine.selection import in_words
+from data_prep.engine.source import Line
 from data_prep.inspection.causes import C2W, OPENCV, OPENGL, W2C, Convention
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
@@ -29,21 +31,23 @@ _OF_SOURCE = {
 _COLMAP = ("cameras.bin", "cameras.txt")
 
 
-def given_of(folder: Path, source: Any) -> tuple[Given, dict[str, Given]]:
-    """Origin of cameras from a source (of index.json), and of single rooms, by id.
+def given_of(folder: Path, source: Any) -> tuple[Given, dict[str, Given], str | None]:
+    """Origin of cameras from a source (of index.json), and of single rooms, by id; and a sentence
+    if more rooms failed than were prepared.
 
     The report says what a room's poses were read from (`PreparedRoom.cameras`). If it is missing or
     from an earlier release, the origin is that of the source.
     """
     usual = _OF_SOURCE.get(str(source), _OF_SOURCE["3d-front"])
-    rooms: dict[str, Given] = {}
     try:
-        for line in read_json(folder / REPORT_NAME)["rooms"]:
-            if line["status"] == "prepared" and line.get("cameras"):
-                rooms[line["room_id"]] = _given(usual, **line["cameras"])
-    except (InputError, KeyError, TypeError, ValueError, AttributeError):
-        rooms = {}
-    return usual, rooms
+        lines = [Line(**line) for line in read_json(folder / REPORT_NAME)["rooms"]]
+        rooms = {line.room_id: _given(usual, **line.cameras) for line in lines if line.cameras}
+    except (InputError, KeyError, TypeError, ValueError):
+        return usual, {}, None
+    failed = [line for line in lines if line.status == "failed"]
+    prepared = sum(line.status == "prepared" for line in lines)
+    said = f"{len(lines)} rooms, {prepared} prepared: {in_words(failed)}"
+    return usual, rooms, said if len(failed) > prepared else None
 
 
 def _given(usual: Given, file: str, room_from_world: list[list[float]]) -> Given:

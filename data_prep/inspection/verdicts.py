@@ -57,6 +57,12 @@ def find_mistake(
 ) -> Finding | None:
     """The likeliest mistake; `try_tracks` is called only if ids are doubted."""
     fit = evidence.share(GIVEN)
+    if evidence.views <= evidence.rooms:
+        return Finding(
+            "views",
+            "there is one frame a room, which shows no depth: give at least two, from different "
+            "places, and better twenty",
+        )
     if evidence.ids >= _SOME_IDS and evidence.once > _ONCE * evidence.ids and evidence.views > 2:
         why = f"{evidence.once} of {evidence.ids} ids are in one image only"
         return Finding("ids", of_ids(evidence, why, given))

@@ -81,8 +81,8 @@ def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> Folder
     index = read_index(folder)
     name = str(index.get("label_set"))
     label_set(name)
-    usual, given = given_of(folder, index.get("source"))
-    problems: list[str] = []
+    usual, given, failures = given_of(folder, index.get("source"))
+    problems = [f"{folder}: {failures}."] if failures and room_id is None else []
     rooms: dict[str, list[RoomCheck]] = {}
     for split in SPLITS:
         if not any((folder / split).glob("*.h5")):
