@@ -149,5 +149,8 @@ def summary(found: FolderCheck) -> str:
         few = f" ({evidence.spare} measurements to spare; too few views show whole objects)"
         parts.append(f"not excluded: {', '.join(no)}{few * (not yes)}")
     if not tallies:
-        parts.append("not checked: the exact scale, and whether all pictures are mirror images")
+        floor = ", the height of the floor" * (evidence.floor_m is None)
+        parts.append(
+            f"not checked: the exact scale{floor}, and whether all pictures are mirror images"
+        )
     return "; ".join(parts) + "."

@@ -47,7 +47,7 @@ def try_tracks(views: RoomViews) -> Trial:
     tracks = associate(masks, views.world_to_camera, views.intrinsics)
     objects = len(tracks.object_class)
     images = np.where(tracks.ids < 0, objects + 1, tracks.ids).astype(np.uint32)
-    seen = observe(images, [*tracks.object_class, VOID])
+    seen = observe(images, [*tracks.object_class.tolist(), VOID])
     found = seen.room_views(views.room_id, views.world_to_camera, views.intrinsics)
     return Trial(*_fit(views), *_fit(found))
 

@@ -15,6 +15,9 @@ from data_prep.inspection.agreement import (
     projections,
 )
 from data_prep.inspection.bodies import Body
+from data_prep.inspection.causes import CHANCE, GIVEN, corrected
+from data_prep.inspection.given import Given
+from data_prep.inspection.words import of_cause
 from sceneprior.core.shards import RoomViews
 
 Bodies = Sequence[Body | None]
@@ -31,9 +34,15 @@ class Trial(NamedTuple):
     """Scale factor, if the repair estimates one."""
 
 
-def try_repairs(bodies: Bodies, views: RoomViews) -> dict[str, Trial]:
+def try_repairs(bodies: Bodies, views: RoomViews, given: Given) -> dict[str, Trial]:
     """Measure the agreement after each repair of a room, by cause."""
-    tried = {cause: repair(bodies, views) for cause, repair in _REPAIRS.items()}
+    tried: dict[str, Trial | None] = {}
+    for cause, (poses, lenses) in corrected(views, given.convention).items():
+        if cause.family not in (GIVEN.family, CHANCE.family, "center"):
+            other = replace(views, world_to_camera=poses, intrinsics=lenses)
+            name = f"{of_cause(cause, given)}; corrected"
+            tried[name] = Trial(compare(bodies, other).agreement)
+    tried |= {cause: repair(bodies, views) for cause, repair in _REPAIRS.items()}
     return {cause: trial for cause, trial in tried.items() if trial is not None}
 
 

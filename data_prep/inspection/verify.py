@@ -142,7 +142,7 @@ def _verdict(
         more = f" and {len(checks) - _NAMED_ROOMS} more" * (len(checks) > _NAMED_ROOMS)
         which = "room" if len(checks) == 1 else f"{len(checks)} of {len(rooms)} rooms,"
         sentences.append(f"{folder}, {which} {named}{more}: {finding.sentence}.")
-    return sentences or _truth_verdict(folder, rooms)
+    return sentences or _truth_verdict(folder, rooms, usual, given)
 
 
 def _tracks_of(folder: Path, checks: Sequence[RoomCheck]) -> Trial:
@@ -154,7 +154,9 @@ def _tracks_of(folder: Path, checks: Sequence[RoomCheck]) -> Trial:
     return add(trials)
 
 
-def _truth_verdict(folder: Path, rooms: Sequence[RoomCheck]) -> list[str]:
+def _truth_verdict(
+    folder: Path, rooms: Sequence[RoomCheck], usual: Given, given: dict[str, Given]
+) -> list[str]:
     """Sentences about ground truth and masks, in all rooms together or in single ones."""
 
     def trials(checks: Sequence[RoomCheck]) -> list[Any]:
@@ -163,21 +165,24 @@ def _truth_verdict(folder: Path, rooms: Sequence[RoomCheck]) -> list[str]:
             with Shard(folder / check.shard) as shard:
                 views = shard.read_room(check.room_id, images=True)
                 bodies, _ = true_bodies(views, shard.read_ground_truth(check.room_id), folder)
-            found.append(try_repairs(bodies, views))
+            found.append(try_repairs(bodies, views, given.get(check.room_id, usual)))
         return found
 
-    agreement = sum((room.agreement for room in rooms), Agreement())
-    if kinds := agreement.failing():
-        wrong = [room for room in rooms if room.agreement.failing()]
-        tried = trials(wrong)
-        return [f"{folder}: {disagreement(agreement, kind, tried)}." for kind in kinds]
     sentences = []
-    for room in rooms:
-        where = f"{folder / room.shard}, room {room.room_id}"
-        kinds = room.agreement.failing(ROOM_SHARE, ROOM_MASKS)
-        tried = trials([room]) if kinds else []
-        said = [disagreement(room.agreement, kind, tried, ROOM_SHARE, ROOM_MASKS) for kind in kinds]
-        sentences += [f"{where}: {sentence}." for sentence in said or room.outliers]
+    wrong = [room for room in rooms if room.agreement.failing()]
+    if 2 * len(wrong) <= len(rooms):
+        for room in rooms:
+            kinds = room.agreement.failing(ROOM_SHARE, ROOM_MASKS)
+            tried = trials([room]) if kinds else []
+            said = [
+                disagreement(room.agreement, kind, tried, ROOM_SHARE, ROOM_MASKS) for kind in kinds
+            ]
+            where = f"{folder / room.shard}, room {room.room_id}"
+            sentences += [f"{where}: {sentence}." for sentence in said or room.outliers]
+    agreement = sum((room.agreement for room in rooms), Agreement())
+    if not sentences and (kinds := agreement.failing()):
+        tried = trials(wrong)
+        sentences = [f"{folder}: {disagreement(agreement, kind, tried)}." for kind in kinds]
     return [text.replace("?.", "?") for text in sentences]
 
 

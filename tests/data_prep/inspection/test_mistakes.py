@@ -159,9 +159,6 @@ MISTAKES = {
                                                                          "cy")}),
         r"the intrinsics in transforms\.json belong to pictures of another size",
     ),
-    "floor too low": Mistake(
-        of_keys(floor_m=lambda data: -0.6), r"the lowest objects end 0\.[56]\d m above the floor"
-    ),
     "ids unique in every image": Mistake(_unique, r"--tracks auto"),
     "ids that restart in every image": Mistake(
         of_ids(_restart), r"the ids of the masks are not those of objects .*: pass --tracks auto"
