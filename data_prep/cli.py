@@ -337,7 +337,7 @@ def _verify(shards: Path, room: str | None, workers: int) -> None:
         others = f" ({more} more problem{'s' * (more > 1)}, listed above)" if more else ""
         typer.echo(f"Error: {found.problems[0]}{others}", err=True)
         raise typer.Exit(3)
-    typer.echo(f"{shards}: all is well. {summary(found)}")
+    typer.echo(f"{shards}: {summary(found)}")
 
 
 def run_job(job: "Job") -> None:

@@ -95,8 +95,8 @@ def first_fault(camera_to_world: np.ndarray, step: int = 1) -> tuple[int, str] |
 def pose_fault(camera_to_world: np.ndarray) -> str:
     """Describe the fault of a (4, 4) pose that `is_pose` rejects.
 
-    >>> pose_fault(np.diag([1.0, 1, -1, 1]))
-    'it is left-handed, a mirror'
+    >>> pose_fault(np.diag([1.0, 1, -1, 1])).split(",")[0]
+    'it is left-handed'
     """
     pose = np.asarray(camera_to_world, dtype=np.float64)
     if not np.isfinite(pose).all():
@@ -111,7 +111,12 @@ def pose_fault(camera_to_world: np.ndarray) -> str:
     scale = abs(determinant) ** (1 / 3)
     if scale and is_pose((pose * [*[1 / scale] * 3, 1])[None])[0]:
         return f"its axes have the length {scale:.3g}, expected 1"
-    return "it is left-handed, a mirror" if determinant < 0 else "its axes are no rotation"
+    if determinant < 0:
+        return (
+            "it is left-handed, as of Unity or Unreal, or mirrored: negate one row of all matrices "
+            "to make their world right-handed"
+        )
+    return "its axes are no rotation"
 
 
 def room_cameras(camera_to_world: np.ndarray, room_from_scan: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ from typing import Any
 
 from data_prep.engine.output import writing
 from data_prep.engine.plan import Plan
+from data_prep.engine.selection import in_words
 from data_prep.engine.source import SPLITS, Expected, Line, PreparedRoom, RoomTask, Source
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
@@ -41,6 +42,7 @@ def line_of(result: PreparedRoom | Line, task: RoomTask, label_set_name: str) ->
         notes=list(result.notes),
         classes=dict(Counter(names[index] for index in views.object_class)),
         unknown_categories=dict(result.unknown_categories),
+        cameras=dict(result.cameras),
     )
 
 
@@ -217,13 +219,14 @@ def finish(out: Path, plan: Plan, totals: Summary) -> None:
         write_changed(out / TABLE_NAME, report_csv(totals.lines))
     # Rules on mesh positions may leave a small `val` or `test` empty, but not `train`.
     planned = any(room.split == "train" for room in plan.rooms) and plan.settings["only"] is None
+    why = in_words(line for line in totals.lines if line.status != "prepared")
     if planned and not totals.counts["train"]["rooms"]:
         raise InputError(
-            f"The 'train' split is empty: all its rooms failed or were filtered; see "
+            f"The 'train' split is empty: all its rooms failed or were filtered ({why}); see "
             f"{out}/{TABLE_NAME}."
         )
     if not totals.statuses.get("prepared"):
-        raise InputError(f"No room was prepared; {out}/{TABLE_NAME} says why.")
+        raise InputError(f"No room was prepared ({why}); see {out}/{TABLE_NAME}.")
     index = {
         "format": "sceneprior-shards",
         "version": 1,

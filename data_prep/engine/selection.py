@@ -106,7 +106,7 @@ def select(survey: Survey, only: str | None, where: str, splits: str = "") -> Su
     )
     if not rooms:
         about = f" for --only {only}" if only else ""
-        raise InputError(f"No room of {where}{about} ({_in_words(left_out)}).")
+        raise InputError(f"No room of {where}{about} ({in_words(left_out)}).")
     if splits and only is None and not any(room.split == "train" for room in rooms):
         raise InputError(
             f"The 'train' split is empty: none of the {len(rooms)} usable rooms is in it. "
@@ -115,7 +115,8 @@ def select(survey: Survey, only: str | None, where: str, splits: str = "") -> Su
     return Survey(rooms, left_out)
 
 
-def _in_words(left_out: Iterable[Line]) -> str:
+def in_words(left_out: Iterable[Line]) -> str:
+    """Number of rooms left out, and the most frequent reason."""
     reasons = [item.reason for item in left_out]
     # Reasons that differ only in numbers count as one; the first is quoted.
     shapes = Counter(re.sub(r"[\d.]+", "#", reason) for reason in reasons)

@@ -74,6 +74,8 @@ class Line:
     """Tracked objects of each class."""
     unknown_categories: dict[str, int] = field(default_factory=dict)
     """Number of pieces per unknown category; see `PreparedRoom`."""
+    cameras: dict[str, Any] = field(default_factory=dict)
+    """Origin of the cameras; see `PreparedRoom`."""
 
 
 @dataclass(frozen=True)
@@ -101,6 +103,9 @@ class PreparedRoom:
     """Parts of the room that were left out, with reasons."""
     unknown_categories: Mapping[str, int] = field(default_factory=dict)
     """Number of pieces per category that is void because the recipe does not mention it."""
+    cameras: Mapping[str, Any] = field(default_factory=dict)
+    """Origin of the cameras, for `inspect --verify`: `file`, the name of the file of poses, and
+    `room_from_world`, 4 rows of 4, the rigid transform from its world, in metres, to the room."""
 
 
 class Source(Protocol):

@@ -14,11 +14,10 @@ from sceneprior.core.shards import RoomViews
 MARGIN = 0.02
 """Tolerance by which a mask may exceed its object's projection, relative to the image's longer
 side. A pose error of 5 cm has this effect at a distance of 2.5 m, in views of 90 degrees."""
-HELD_AT_LEAST = {"mesh": 0.95, "box": 0.8, "found": 0.5}
+HELD_AT_LEAST = {"mesh": 0.95, "box": 0.8}
 """Minimum share of masks that lie within their projections. Occluders and the image border only
-shrink masks, so with correct poses all should. Boxes found from the masks are an exception: they
-are too small for objects that are never fully visible. Shuffled cameras reach 0.07 to 0.15."""
-IOU_AT_LEAST = {"mesh": 0.85, "box": 0.5, "found": 0.7}
+shrink masks, so with correct poses all should. Shuffled cameras reach 0.07 to 0.15."""
+IOU_AT_LEAST = {"mesh": 0.85, "box": 0.5}
 """Minimum mean IoU of the 2D boxes of fully visible objects. A mesh and its mask agree to the
 pixel, except for parts thinner than a pixel. The corners of a 3D box project beyond its object's
 silhouette, and annotated boxes are fitted to incomplete scans."""

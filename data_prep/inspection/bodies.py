@@ -1,4 +1,4 @@
-"""3D representation of each object of a room: its mesh, its 3D box, or a box found from masks."""
+"""3D representation of each object of a room's ground truth: its mesh, or its 3D box."""
 
 from functools import lru_cache
 from pathlib import Path
@@ -7,13 +7,12 @@ from typing import NamedTuple
 import numpy as np
 
 from data_prep.inspection.projection import Hull, hull_of
-from data_prep.upright import fit_upright
 from sceneprior.core.errors import ShardError
 from sceneprior.core.geometry.corners import BOX_EDGES, box_corners
 from sceneprior.core.ground_truth import load_model, model_path
 from sceneprior.core.shards import RoomGroundTruth, RoomViews
 
-KINDS = {"mesh": "meshes", "box": "3D boxes", "found": "boxes found from the masks"}
+KINDS = {"mesh": "meshes", "box": "3D boxes"}
 """Names of the types of 3D representations, for messages."""
 _BOX_SLACK_M = 0.005
 """Tolerance between the stored box and the placed mesh, whose vertices are float32."""
@@ -59,15 +58,6 @@ def true_bodies(
             body = body._replace(unoccluded=truth.unoccluded[:, k])
         bodies.append(body)
     return bodies[: len(views.object_class)], problems
-
-
-def found_bodies(views: RoomViews) -> list[Body | None]:
-    """Upright boxes found from the masks alone; None if the views do not determine them."""
-    found, _ = fit_upright(views, views.image_size, views.world_to_camera, views.intrinsics)
-    return [
-        Body("found", Hull(corners, np.array(BOX_EDGES))) if np.isfinite(corners).all() else None
-        for corners in found
-    ]
 
 
 def _placed(hull: Hull, model_to_room: np.ndarray) -> Hull:

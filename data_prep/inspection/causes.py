@@ -1,259 +1,169 @@
-"""Diagnoses camera errors: undoes common mistakes on trial and compares the result with masks."""
+"""Mistakes in cameras, and a room's cameras after the correction of each."""
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from itertools import permutations, product
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
-from data_prep.inspection.agreement import (
-    Agreement,
-    Comparison,
-    compare,
-    compare_boxes,
-    projections,
-)
-from data_prep.inspection.bodies import Body, found_bodies
 from sceneprior.core.shards import RoomViews
 
-Bodies = Sequence[Body | None]
+Axes = tuple[tuple[int, ...], ...]
+"""Axes of a camera, x, y and z, as rows: the part of each to the right, down and forward."""
+OPENCV: Axes = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+OPENGL: Axes = ((1, 0, 0), (0, -1, 0), (0, 0, -1))
+C2W, W2C, TURNED, MOVED = "c2w", "w2c", "turned", "moved"
+"""Contents of a matrix: camera to world, world to camera; a camera's position beside the rotation
+from world to camera, and a rotation from camera to world beside the translation to the camera."""
+FOCAL_STEPS = tuple(k for k in range(-8, 9) if k)
+"""Powers of 2^(1/6) = 1.12 by which focal lengths are scaled: 0.4 to 2.5."""
+_OFF = (-0.3, -0.15, 0.0, 0.15, 0.3)
+_SHIFTS = tuple((across, down) for across in _OFF for down in _OFF if across or down)
+"""Shifts of the principal point, relative to the image's size."""
 
-CHANCE = "chance"
-"""Cause under which the baseline, shuffled cameras, is listed; it is not a mistake."""
-_OPENGL_AXES = np.diag(np.array([1, -1, -1, 1], dtype=np.float32))
-_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float32)
-"""Rotation from a world with y up to one with z up."""
 
+class Cause(NamedTuple):
+    """A mistake in a room's cameras, of one of these families; other fields keep their defaults.
 
-class Trial(NamedTuple):
-    """Result of one repair."""
+    given: none. poses: matrices hold `reading` with `axes`; the world is left-handed if the axes
+    are. order: frames are in the order `detail`. focal: focal lengths must be `factor` times as
+    long. center: the principal point must be moved by `shift`. middle: it must be in the middle.
+    size: the intrinsics are of pictures of another size. chance: cameras of other frames.
+    """
 
-    agreement: Agreement
+    family: str
+    reading: str = ""
+    axes: Axes = ()
+    detail: str = ""
     factor: float = 1.0
-    """Scale factor, if the repair estimates one."""
+    shift: tuple[float, float] = (0.0, 0.0)
 
 
-def try_repairs(bodies: Bodies, views: RoomViews) -> dict[str, Trial]:
-    """Measure the agreement after each repair of a room's cameras, by cause.
+GIVEN, CHANCE = Cause("given"), Cause("chance")
 
-    Boxes found from masks depend on the cameras, so they are found again after each repair.
+
+Cameras = tuple[np.ndarray, np.ndarray]
+"""world_to_camera, (T, 4, 4), and intrinsics, (T, 3, 3), both float64."""
+
+
+class Convention(NamedTuple):
+    """Convention of the matrices that a room's cameras were read from."""
+
+    reading: str = W2C
+    axes: Axes = OPENCV
+    room_from_world: np.ndarray = np.eye(4)
+    """(4, 4) rigid, from the world of the matrices (in metres) to the room."""
+
+
+def corrected(views: RoomViews, convention: Convention) -> dict[Cause, Cameras]:
+    """Cameras after the correction of each cause; `GIVEN` has them as they are.
+
+    The causes depend on the convention alone, so that rooms can be added up. Likelier ones come
+    first.
     """
-    found = any(body is not None and body.kind == "found" for body in bodies)
-    repairs = {**_ANY, **(_OF_FOUND if found else {})}
-    trials = {}
-    for cause, repair in repairs.items():
-        repaired = repair(views)
-        if repaired is not None:
-            again = found_bodies(repaired) if found else bodies
-            trials[cause] = Trial(compare(again, repaired).agreement)
-    for cause, measure in () if found else _OF_TRUTH.items():
-        if (trial := measure(bodies, views)) is not None:
-            trials[cause] = trial
-    return trials
+    poses, lenses = views.world_to_camera.astype(np.float64), views.intrinsics.astype(np.float64)
+    found = {GIVEN: (poses, lenses)}
+    for cause, other in _poses(poses, convention).items():
+        found[cause] = other, lenses
+    for name, order in _orders(len(poses)).items():
+        found[Cause("order", detail=name)] = poses[order], lenses
+    for cause, lens in _lenses(lenses, views.image_size).items():
+        found[cause] = poses, lens
+    found[CHANCE] = poses[_dealt_out(len(poses))], lenses
+    return found
 
 
-def likely_cause(
-    trials: Iterable[dict[str, Trial]], kind: str, share: float = 1.0, least: int = 1
-) -> str:
-    """Name the mistake whose repair makes the masks agree (`passes`), as the end of a sentence."""
-    sums: dict[str, Trial] = {}
-    for tried in trials:
-        for cause, trial in tried.items():
-            before = sums.get(cause, Trial(Agreement(), trial.factor))
-            # The factors of different rooms differ by less than is printed: keep the first.
-            sums[cause] = Trial(before.agreement + trial.agreement, before.factor)
-    good = {
-        cause: trial for cause, trial in sums.items()
-        if cause != CHANCE and trial.agreement.passes(kind, share, least)
-    }  # fmt: skip
-    if not good:
-        return "is an axis or a unit wrong?"
-
-    best = max(good, key=lambda cause: round(_how_well(good[cause]), 2))  # the first of equals
-    trial = good[best]
-    tally = trial.agreement.of(kind)
-    text = f"{best.format(factor=trial.factor)}, {tally.share:.0%} would"
-    return text + (f", with a mean 2D IoU of {tally.mean_iou:.2f}" if tally.whole else "")
-
-
-def chance_of(trials: Iterable[dict[str, Trial]], kind: str) -> float:
-    """Share of the masks that agree with shuffled cameras; NaN if that was not tried."""
-    tallies = [tried[CHANCE].agreement.of(kind) for tried in trials if CHANCE in tried]
-    masks = sum(tally.masks for tally in tallies)
-    return sum(tally.held for tally in tallies) / masks if masks else float("nan")
+def _poses(poses: np.ndarray, convention: Convention) -> dict[Cause, np.ndarray]:
+    """World-to-camera matrices if the written ones held something else, or had other axes."""
+    of_world = np.linalg.inv(convention.room_from_world) @ np.linalg.inv(poses)
+    written = of_world @ np.linalg.inv(_square(convention.axes))
+    if convention.reading == W2C:
+        written = np.linalg.inv(written)
+    rotation, translation = written[:, :3, :3], written[:, :3, 3:]
+    contents = {
+        C2W: written,
+        W2C: np.linalg.inv(written),
+        TURNED: _matrix(rotation.swapaxes(1, 2), translation),
+        MOVED: _matrix(rotation, -rotation @ translation),
+    }
+    usual = [(reading, axes) for reading in contents for axes in (OPENGL, OPENCV)]
+    rare = [(convention.reading, axes) for axes in _all_axes() if axes not in (OPENGL, OPENCV)]
+    found = {}
+    for reading, axes in usual + rare:
+        if (reading, axes) != (convention.reading, convention.axes):
+            camera_to_world = contents[reading] @ _square(axes)
+            # A mirrored world can be turned until the room's z is the mirrored axis.
+            mirror = np.diag([1.0, 1, np.linalg.det(_square(axes)), 1])
+            in_room = mirror @ convention.room_from_world @ camera_to_world
+            found[Cause("poses", reading, axes)] = np.linalg.inv(in_room)
+    return found
 
 
-def out_of_order(bodies: Bodies, views: RoomViews) -> tuple[np.ndarray, Comparison]:
-    """Match cameras to frames one to one, so that they fit the masks best.
-
-    Returns, for each frame, the index of the frame whose camera fits, (T,), its own if no other
-    fits better; and the comparison with these cameras.
-    """
-    boxes = projections(bodies, views)[:, None]  # one per camera, the same for all frames
-    frames = len(views.visible)
-    boxes = np.broadcast_to(boxes, (frames, frames, *boxes.shape[2:]))
-    pairs = compare_boxes(bodies, boxes, views)
-    gain = ((pairs.held + pairs.iou) * pairs.judged).sum(axis=-1) + 1e-3 * np.eye(frames)
-    order = linear_sum_assignment(gain.T, maximize=True)[1]
-    moved = [
-        body if body is None or body.unoccluded is None
-        else body._replace(unoccluded=body.unoccluded[order])
-        for body in bodies
-    ]  # fmt: skip
-    return order, compare_boxes(moved, boxes[order, 0], views)
-
-
-def _other_ids(bodies: Bodies, views: RoomViews) -> Trial | None:
-    """Match masks to the objects that they fit best.
-
-    Masks that fit no object are left out, as ids may have been shifted onto walls; None if the
-    others are less than a quarter of all masks.
-    """
-    boxes = projections(bodies, views)
-    pairs = [
-        compare_boxes(bodies, np.broadcast_to(boxes[:, k : k + 1], boxes.shape), views)
-        for k in range(len(bodies))
+def _all_axes() -> list[Axes]:
+    """The 48 assignments of a camera's axes, left-handed ones last."""
+    signed = [
+        tuple(
+            tuple(sign * (k == place) for k in range(3))
+            for place, sign in zip(order, signs, strict=True)
+        )
+        for order in permutations(range(3))
+        for signs in product((1, -1), repeat=3)
     ]
-    seen = views.visible.sum(axis=0)
-    held = np.stack([(pair.held & views.visible).sum(axis=0) for pair in pairs], axis=1)
-    iou = np.stack([(pair.iou * views.visible).sum(axis=0) for pair in pairs], axis=1)
-    rows, others = linear_sum_assignment(held + iou, maximize=True)
-    fits = held[rows, others] > seen / 2
-    if seen[fits].sum() < seen.sum() / 4:
-        return None
-    exchanged = [bodies[other] if fit else None for other, fit in zip(others, fits, strict=True)]
-    return Trial(compare(exchanged, views).agreement)
+    return sorted(signed, key=lambda axes: -round(np.linalg.det(np.array(axes))))
 
 
-def _posed(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[RoomViews], RoomViews]:
-    return lambda views: replace(views, world_to_camera=change(views.world_to_camera))
+def _square(axes: Axes) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3] = axes
+    return matrix
 
 
-def _transposed(poses: np.ndarray) -> np.ndarray:
-    turned = poses.copy()
-    turned[:, :3, :3] = poses[:, :3, :3].transpose(0, 2, 1)
-    return turned
+def _matrix(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    matrix = np.tile(np.eye(4), (len(rotation), 1, 1))
+    matrix[:, :3, :3], matrix[:, :3, 3:] = rotation, translation
+    return matrix
 
 
-def _dealt_out(poses: np.ndarray) -> np.ndarray:
-    """Shuffle the poses so that no camera keeps its frame."""
-    order = np.random.default_rng(0).permutation(len(poses))
-    dealt = np.empty_like(poses)
-    dealt[order] = poses[np.roll(order, 1)]
+def _orders(frames: int) -> dict[str, np.ndarray]:
+    """For each way in which poses may be misplaced, the place of each frame's own pose."""
+    numbers = np.arange(frames)
+    as_text = np.array(sorted(range(frames), key=lambda k: str(k + 1)), dtype=np.int64)
+    return {
+        "the frame before": np.roll(numbers, -1),
+        "the next frame": np.roll(numbers, 1),
+        "the frame two before": np.roll(numbers, -2),
+        "the frame two later": np.roll(numbers, 2),
+        "reverse": numbers[::-1],
+        "sorted as text": np.argsort(as_text),
+        "sorted as numbers": as_text,
+    }
+
+
+def _lenses(lenses: np.ndarray, image_size: tuple[int, int]) -> dict[Cause, np.ndarray]:
+    height, width = image_size
+    size = np.array([width, height], dtype=np.float64)
+    found = {}
+    for step in FOCAL_STEPS:
+        factor = 2 ** (step / 6)
+        other = lenses.copy()
+        other[:, [0, 1], [0, 1]] *= factor
+        found[Cause("focal", factor=factor)] = other
+    middle = lenses.copy()
+    middle[:, :2, 2] = size / 2
+    found[Cause("middle")] = middle
+    resized = lenses.copy()
+    center = lenses[:, :2, 2]
+    resized[:, :2] *= (size / 2 / np.where(center > 0, center, size / 2))[..., None]
+    found[Cause("size")] = resized
+    for shift in _SHIFTS:
+        other = lenses.copy()
+        other[:, :2, 2] += size * np.array(shift)
+        found[Cause("center", shift=shift)] = other
+    return found
+
+
+def _dealt_out(frames: int) -> np.ndarray:
+    """A shuffled order in which no frame keeps its place."""
+    order = np.random.default_rng(0).permutation(frames)
+    dealt = np.empty_like(order)
+    dealt[order] = np.roll(order, 1)
     return dealt
-
-
-def _of_this_size(views: RoomViews) -> RoomViews | None:
-    """Scale intrinsics so that the principal point becomes central; None if it already is."""
-    height, width = views.image_size
-    middle = views.intrinsics[:, :2, 2]
-    scale = np.array([width, height]) / 2 / np.where(middle > 0, middle, np.inf)
-    if (np.abs(scale - 1) < 0.1).all() or not (scale > 0).all():
-        return None
-    lenses = views.intrinsics.copy()
-    lenses[:, :2] *= scale[..., None]
-    return replace(views, intrinsics=lenses)
-
-
-def _focal_factor(bodies: Bodies, views: RoomViews) -> Trial | None:
-    """Estimate the scale of the focal lengths from distances of objects to the principal point."""
-    height, width = views.image_size
-    boxes = projections(bodies, views)
-    seen = compare_boxes(bodies, boxes, views)
-    rows, items = np.nonzero(seen.judged & seen.whole)
-    masks, boxes = views.boxes[rows, items] * [width, height, width, height], boxes[rows, items]
-    middle = views.intrinsics[rows, :2, 2]
-    is_at, would_be = (((sides[:, :2] + sides[:, 2:]) / 2 - middle) for sides in (masks, boxes))
-    # Near the principal point, positions hardly depend on the focal length.
-    far = np.linalg.norm(would_be, axis=1) > width / 20
-    ratios = (is_at * would_be).sum(axis=1)[far] / (would_be**2).sum(axis=1)[far]
-    return _scaled(bodies, views, ratios, "intrinsics")
-
-
-def _unit_factor(bodies: Bodies, views: RoomViews) -> Trial | None:
-    """Estimate the scale of the translations at which rays through 2D boxes meet their objects."""
-    height, width = views.image_size
-    pairs = np.argwhere(compare(bodies, views).judged)
-    if not len(pairs):
-        return None
-    rows, items = pairs.T
-    centers = np.array(
-        [
-            np.zeros(3) if body is None
-            else (body.hull.points_m.min(axis=0) + body.hull.points_m.max(axis=0)) / 2
-            for body in bodies
-        ]
-    )[items]  # fmt: skip
-    middles = (views.boxes[rows, items, :2] + views.boxes[rows, items, 2:]) / 2 * [width, height]
-    pixels = np.concatenate([middles, np.ones((len(rows), 1))], axis=1)
-    rays = np.linalg.solve(views.intrinsics[rows].astype(np.float64), pixels[..., None])[..., 0]
-    poses = views.world_to_camera[rows].astype(np.float64)
-    across = np.cross(rays, poses[:, :3, 3])
-    off = np.cross(rays, (poses[:, :3, :3] @ centers[..., None])[..., 0])
-    length = (across**2).sum(axis=1)
-    ratios = -(across * off).sum(axis=1) / np.where(length > 0, length, np.nan)
-    return _scaled(bodies, views, ratios, "world_to_camera")
-
-
-def _scaled(bodies: Bodies, views: RoomViews, ratios: np.ndarray, array: str) -> Trial | None:
-    """Scale focal lengths or translations by the best factor near the median of `ratios`."""
-    ratios = ratios[np.isfinite(ratios)]
-    factor = float(np.median(ratios)) if len(ratios) else 0.0
-    if factor <= 0:
-        return None
-    part = (slice(None), [0, 1], [0, 1]) if array == "intrinsics" else (slice(None), slice(3), 3)
-
-    def tried(factor: float) -> Trial:
-        changed = getattr(views, array).copy()
-        changed[part] *= factor
-        return Trial(compare(bodies, replace(views, **{array: changed})).agreement, factor)
-
-    # Centres of 2D boxes are not exactly those of the objects, so the factor is refined.
-    for step in (1.12, 1.04, 1.015):
-        factor = max((tried(factor * step**k) for k in (0, -1, 1, -2, 2)), key=_how_well).factor
-    return tried(factor)
-
-
-def _how_well(trial: Trial) -> float:
-    tallies = trial.agreement.tallies.values()
-    return sum(tally.share + (tally.mean_iou if tally.whole else 0.0) for tally in tallies)
-
-
-_ANY: dict[str, Callable[[RoomViews], RoomViews | None]] = {
-    "world_to_camera seems to hold camera-to-world matrices; inverted": _posed(np.linalg.inv),
-    "the cameras seem to have OpenGL axes (y up, z backward) instead of OpenCV's; with y and z "
-    "flipped": _posed(lambda poses: _OPENGL_AXES @ poses),
-    "world_to_camera seems to hold camera-to-world matrices with OpenGL axes; inverted, and with "
-    "y and z flipped": _posed(lambda poses: _OPENGL_AXES @ np.linalg.inv(poses)),
-    "the rotations of world_to_camera seem to be transposed; transposed back": _posed(_transposed),
-    "the intrinsics seem to be those of pictures of another size; scaled to these": _of_this_size,
-    CHANCE: _posed(_dealt_out),
-}
-"""Repairs by cause, the beginning of a sentence; a repair returns None if it does not apply."""
-_OF_FOUND: dict[str, Callable[[RoomViews], RoomViews | None]] = {
-    "each frame seems to have the camera of the frame before; with that of the next": _posed(
-        lambda poses: np.roll(poses, -1, axis=0)
-    ),
-    "each frame seems to have the camera of the next; with that of the frame before": _posed(
-        lambda poses: np.roll(poses, 1, axis=0)
-    ),
-    "the cameras seem to be in reverse order; with the first for the last": _posed(
-        lambda poses: poses[::-1].copy()
-    ),
-}
-_OF_TRUTH: dict[str, Callable[[Bodies, RoomViews], Trial | None]] = {
-    "the cameras' world seems to have z up instead of y; turned": lambda bodies, views: Trial(
-        compare(bodies, _posed(lambda poses: poses @ _Z_UP)(views)).agreement
-    ),
-    "the focal lengths seem to be wrong; times {factor:.2f}": _focal_factor,
-    "the translations of the cameras seem to have another unit than the objects; times "
-    "{factor:.2g}": _unit_factor,
-    "frames and cameras seem to be out of order; with cameras of other frames of the room": (
-        lambda bodies, views: Trial(out_of_order(bodies, views)[1].agreement)
-    ),
-    "the instance ids of the masks seem to be those of other objects; with ids exchanged": (
-        _other_ids
-    ),
-}
-"""Repairs that need 3D objects that do not depend on the cameras."""

@@ -1,6 +1,7 @@
 """The tables and sentences that `sceneprior inspect` prints."""
 
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.table import Column, Table
@@ -9,13 +10,17 @@ from data_prep.engine.report_tables import make_table
 from data_prep.engine.source import SPLITS
 from data_prep.inspection.agreement import Agreement
 from data_prep.inspection.bodies import KINDS
+from data_prep.inspection.causes import CHANCE, GIVEN
+from data_prep.inspection.evidence import total
 from data_prep.inspection.pictures import choose_views
-from data_prep.inspection.verify import FolderCheck
+from data_prep.inspection.verdicts import what_was_checked
+from data_prep.inspection.verify import FolderCheck, RoomCheck
+from data_prep.inspection.words import counts
 from sceneprior.core.classes import label_set
 from sceneprior.core.shards import Shard, iterate_rooms, read_index
 
 _WORST_SHOWN = 5
-_JUDGED = ("in 3D", "masks within", "mean 2D IoU")
+_JUDGED = ("fit of cameras", "in 3D", "masks within", "mean 2D IoU")
 
 
 def count_tables(folder: Path) -> list[Table]:
@@ -75,25 +80,36 @@ def check_tables(found: FolderCheck) -> list[Table]:
     for split, checks in found.rooms.items():
         rooms = [check for check in checks if check.room_id]
         views, sums = sum(room.views for room in rooms), sum(room.has_checksum for room in rooms)
-        agreement = sum((check.agreement for check in rooms), Agreement())
-        totals.append((split, len(rooms), views, f"{sums} rooms", *_judged(agreement)))
-    agreements = [(check.room_id, check.agreement) for check in found.every]
-    worst = sorted(
-        (min(tally.share for tally in agreement.tallies.values()), room_id, _judged(agreement))
-        for room_id, agreement in agreements
-        if agreement.tallies
-    )
+        totals.append((split, len(rooms), views, f"{sums} rooms", *_judged(checks)))
+    judged = [
+        check for check in found.every if check.agreement.tallies or _fit([check]) is not None
+    ]
     tables = [make_table(("split", "rooms", "views", "checksums", *_JUDGED), totals)]
-    if worst:
+    if judged:
+        worst = sorted(judged, key=_least)[:_WORST_SHOWN]
         # Folded, because the end of an id, its room's name, must survive narrow terminals.
         columns = (Column("worst rooms", overflow="fold"), *_JUDGED)
-        rows = [(room_id, *cells) for _, room_id, cells in worst[:_WORST_SHOWN]]
-        tables.append(make_table(columns, rows))
+        tables.append(make_table(columns, [(check.room_id, *_judged([check])) for check in worst]))
     return tables
 
 
-def _judged(agreement: Agreement) -> list[str]:
-    """Table cells: 3D representation, share of masks within projections, IoU if fully visible."""
+def _least(check: RoomCheck) -> float:
+    shares = [tally.share for tally in check.agreement.tallies.values()]
+    fit = _fit([check])
+    return min(shares if fit is None else [*shares, fit])
+
+
+def _fit(checks: Sequence[RoomCheck]) -> float | None:
+    """Fit of masks and cameras; None if nothing determines it."""
+    known = [check.evidence for check in checks if check.evidence is not None]
+    evidence = total(known) if known else None
+    return evidence.share(GIVEN) if evidence is not None and evidence.spare else None
+
+
+def _judged(checks: Sequence[RoomCheck]) -> list[str]:
+    """Table cells: fit of masks and cameras; 3D representation, share of masks within projections,
+    IoU if fully visible."""
+    agreement = sum((check.agreement for check in checks), Agreement())
     cells = [
         (
             KINDS[kind],
@@ -102,25 +118,39 @@ def _judged(agreement: Agreement) -> list[str]:
         )
         for kind, tally in agreement.tallies.items()
     ]
-    return ["\n".join(lines) for lines in zip(*cells, strict=True)] or ["-"] * 3
+    fit = _fit(checks)
+    of_truth = ["\n".join(lines) for lines in zip(*cells, strict=True)] or ["-"] * 3
+    return ["-" if fit is None else f"{fit:.2f}", *of_truth]
 
 
 def summary(found: FolderCheck) -> str:
-    """Say how well a folder without problems agrees."""
-    without = sum(not check.has_checksum for check in found.every)
-    parts = ["Checksums, shapes, ranges, 2D boxes and masks agree"]
-    if without:
+    """Say what was checked in a folder without problems, and what could not be."""
+    evidence = found.evidence
+    assert evidence is not None, "a folder without problems has evidence"
+    yes, no = what_was_checked(evidence)
+    tallies = found.agreement.tallies
+    begin = "all is well" if yes or tallies else "nothing wrong is found, but little is checked"
+    parts = [f"{begin}. Checksums, shapes, ranges, 2D boxes and masks agree"]
+    if without := sum(not check.has_checksum for check in found.every):
         parts.append(f"{without} rooms carry no checksum (shards of an earlier release)")
-    for kind, tally in found.agreement.tallies.items():
+    for kind, tally in tallies.items():
         text = f"{tally.share:.1%} of {tally.masks} masks lie within their projected {KINDS[kind]}"
         if tally.whole:
             text += f"; {tally.whole} unoccluded ones have a mean 2D IoU of {tally.mean_iou:.3f}"
         parts.append(text)
-    if not found.agreement.tallies:
-        parts.append("no object could be compared with its masks in 3D")
-    elif "found" in found.agreement.tallies:
+    parts.append(counts(evidence))
+    fit = (
+        f"masks fit the cameras by {evidence.share(GIVEN):.2f} of 1 (shuffled cameras: "
+        f"{evidence.share(CHANCE):.2f})"
+    )
+    if yes:
+        parts.append(f"{fit}, which excludes {', '.join(yes)}")
+    if no:
+        few = f" ({evidence.spare} measurements to spare; too few views show whole objects)"
+        parts.append(f"not excluded: {', '.join(no)}{few * (not yes)}")
+    if not tallies:
+        floor = ", the height of the floor" * (evidence.floor_m is None)
         parts.append(
-            "boxes found from masks cannot show whether everything is too large, too small or "
-            "mirrored"
+            f"not checked: the exact scale{floor}, and whether all pictures are mirror images"
         )
     return "; ".join(parts) + "."

@@ -1,114 +1,167 @@
-"""Turns the agreement of 3D objects and masks into sentences about a room or a folder."""
+"""One verdict from the evidence of rooms: the likeliest mistake, or what was checked."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
-from data_prep.inspection.agreement import (
-    HELD_AT_LEAST,
-    IOU_AT_LEAST,
-    ROOM_SHARE,
-    Agreement,
-    Comparison,
-)
-from data_prep.inspection.bodies import KINDS, Body
-from data_prep.inspection.causes import Trial, chance_of, likely_cause, out_of_order
-from sceneprior.core.shards import RoomViews
+from data_prep.inspection.causes import CHANCE, FOCAL_STEPS, GIVEN, Cause
+from data_prep.inspection.evidence import Evidence
+from data_prep.inspection.given import Given
+from data_prep.inspection.tracking import Trial
+from data_prep.inspection.words import UNITS_M, of_cause, of_ids, of_unit, of_up
 
-_ROOM_MASKS = 5
-"""Minimum number of masks for a statement about a room."""
-_OUTLIER = 0.5
-"""Share of agreeing masks below which a view or object is reported, in a room that agrees as a
-whole."""
-_CAMERA_HEIGHTS_M = 0.2, 4.0
-_OBJECT_SIZES_M = 0.15, 6.0
-"""Plausible ranges of a room's median camera height and median object length."""
+_SPARE_AT_LEAST = 12
+"""Spare middles from which on cameras are compared at all."""
+_MARGIN, _MARGIN_OF_ONE = 0.05, 0.5
+"""A correction must raise the mean agreement by the first, plus the second divided by the square
+root of the spare middles."""
+_FIT_AT_LEAST = 0.5
+"""Mean agreement below which cameras and masks do not fit. Right rooms reach 0.75 to 0.95, with
+errors of 3 cm and 1.5 degrees 0.7; shuffled cameras 0.2."""
+_GOOD = 0.6
+"""Mean agreement that a correction must reach, and below which ids are doubted."""
+_NEARNESS = 0.1
+"""Mean correlation below which poses belong to other frames; right rooms have 0.1 to 0.7."""
+_EYES_M, _LENGTHS_M = (0.2, 4.0), (0.15, 6.0)
+"""Plausible ranges of the median camera height and of the median length of objects."""
+_FLOOR_M = 0.15
+_ONCE, _SOME_IDS = 0.8, 8
+"""Share of ids in a single view above which ids are not tracked, if there are so many."""
 
-Trials = Sequence[dict[str, Trial]]
+
+class Finding(NamedTuple):
+    """A mistake, by a key that is the same for rooms with the same mistake, and its sentence."""
+
+    key: object
+    sentence: str
 
 
-def disagreement(
-    agreement: Agreement, kind: str, trials: Trials, share: float = 1.0, least: int = 1
-) -> str:
-    """Say that masks and 3D objects disagree, and name the likely cause; without the full stop."""
-    tally = agreement.of(kind)
-    text = (
-        f"{tally.share:.0%} of {tally.masks} masks lie within the projected {KINDS[kind]}, "
-        f"expected at least {share * HELD_AT_LEAST[kind]:.0%}"
+def margin(evidence: Evidence) -> float:
+    """Least difference in mean agreement that is no accident."""
+    return _MARGIN + _MARGIN_OF_ONE / max(evidence.spare, 1) ** 0.5
+
+
+def camera_cause(evidence: Evidence) -> Cause | None:
+    """Cause whose correction makes masks and cameras agree clearly better, if there is one."""
+    if evidence.spare < _SPARE_AT_LEAST:
+        return None
+    causes = [cause for cause in evidence.sums if cause != CHANCE]
+    best = max(causes, key=lambda cause: round(evidence.share(cause), 2))  # the first of equals
+    gain = evidence.share(best) - evidence.share(GIVEN)
+    return best if gain > margin(evidence) and evidence.share(best) >= _GOOD else None
+
+
+def find_mistake(
+    evidence: Evidence, given: Given, try_tracks: Callable[[], Trial]
+) -> Finding | None:
+    """The likeliest mistake; `try_tracks` is called only if ids are doubted."""
+    fit = evidence.share(GIVEN)
+    if evidence.views <= evidence.rooms:
+        return Finding(
+            "views",
+            "there is one frame a room, which shows no depth: give at least two, from different "
+            "places, and better twenty",
+        )
+    if evidence.ids >= _SOME_IDS and evidence.once > _ONCE * evidence.ids and evidence.views > 2:
+        why = f"{evidence.once} of {evidence.ids} ids are in one image only"
+        return Finding("ids", of_ids(evidence, why, given))
+    if (cause := camera_cause(evidence)) is not None:
+        said = f"{fit:.2f} as given, {evidence.share(cause):.2f} corrected"
+        return Finding(cause, f"{of_cause(cause, given)} (fit of masks and poses: {said})")
+    doubted = evidence.spare >= _SPARE_AT_LEAST and fit < _GOOD
+    if doubted and (trial := try_tracks()).repairs:
+        said = f"{trial.given / max(trial.given_middles, 1):.2f} with these ids, "
+        said += f"{trial.found / trial.found_middles:.2f} with objects found without them"
+        return Finding("ids", of_ids(evidence, f"fit of masks and poses: {said}", given))
+    if doubted and fit + margin(evidence) / 2 < _FIT_AT_LEAST:
+        return _unexplained(evidence, given)
+    return _implausible(evidence, given)
+
+
+def _unexplained(evidence: Evidence, given: Given) -> Finding:
+    said = (
+        f"fit {evidence.share(GIVEN):.2f}, with shuffled poses {evidence.share(CHANCE):.2f}, "
+        f"expected at least {_FIT_AT_LEAST:g}"
     )
-    if tally.whole:
-        text += (
-            f", and those of unoccluded objects overlap with a mean 2D IoU of "
-            f"{tally.mean_iou:.2f}, expected at least {share * IOU_AT_LEAST[kind]:.2f}"
+    if evidence.nearness is not None and evidence.nearness < _NEARNESS:
+        return Finding(
+            "frames",
+            f"the poses in {given.file} belong to other frames than the masks ({said}; cameras "
+            "that are turned alike do not show the same objects): pair each pose with its picture",
         )
-    chance = chance_of(trials, kind)
-    if tally.share <= chance + 0.1:
-        text += f"; no better than randomly shuffled cameras ({chance:.0%})"
-    return f"{text}: {likely_cause(trials, kind, share, least)}"
+    return Finding(
+        "unknown",
+        f"masks and poses in {given.file} do not fit ({said}), and no known mistake explains it: "
+        "are the poses those of these pictures, and exact to a few centimetres?",
+    )
 
 
-def room_problems(
-    bodies: Sequence[Body | None], views: RoomViews, seen: Comparison, trials: Trials
-) -> Iterator[str]:
-    """Report the problems of a room as sentences without its name.
-
-    For boxes found from the masks, units are checked instead of single views and objects.
-    """
-    agreement = seen.agreement
-    failing = agreement.failing(ROOM_SHARE, _ROOM_MASKS)
-    for kind in failing:
-        yield disagreement(agreement, kind, trials, ROOM_SHARE, _ROOM_MASKS)
-    if "found" in seen.kinds:
-        yield from _unit_problems(bodies, views)
-    elif not failing:
-        yield from _outliers(bodies, views, seen)
-
-
-def _outliers(bodies: Sequence[Body | None], views: RoomViews, seen: Comparison) -> Iterator[str]:
-    """Report views and objects that disagree in a room that agrees as a whole."""
-    count, held = seen.judged.sum(axis=1), (seen.judged & seen.held).sum(axis=1)
-    wrong = np.flatnonzero((count >= 2) & (held < _OUTLIER * count))
-    if len(wrong):
-        order, _ = out_of_order(bodies, views)
-        others = [int(order[view]) for view in wrong]
-        why = "are their poses wrong?"
-        if set(others) & set(wrong.tolist()) and (order[wrong] != wrong).all():
-            pairs = (f"{view} (by {other})" for view, other in zip(wrong, others, strict=True))
-            why = f"those of other frames would fit: {', '.join(pairs)}"
-        yield (
-            f"{held[wrong].sum()} of the {count[wrong].sum()} masks of views "
-            f"{_listed(wrong)} lie within their projections, in other views nearly all do: {why}"
-        )
-    seen_in = seen.judged.sum(axis=0)
-    lost = (seen.judged & ~seen.held).sum(axis=0)
-    for k in np.flatnonzero((seen_in >= 3) & (lost > _OUTLIER * seen_in)):
-        if not len(wrong):
-            yield (
-                f"object {k} is not where its ground truth has it: {lost[k]} of its {seen_in[k]} "
-                "masks reach beyond its projection, unlike those of other objects"
-            )
-
-
-def _listed(numbers: np.ndarray) -> str:
-    shown = ", ".join(str(number) for number in numbers[:6])
-    return shown + (f" and {len(numbers) - 6} more" if len(numbers) > 6 else "")
-
-
-def _unit_problems(bodies: Sequence[Body | None], views: RoomViews) -> Iterator[str]:
-    """Report implausible camera heights and object sizes.
-
-    Masks and poses alone do not determine the scale, but floor and furniture have typical sizes.
-    """
-    poses = views.world_to_camera.astype(np.float64)
-    eyes = -(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0]
-    height = float(np.median(eyes[:, 1]))
-    sizes = [np.ptp(body.hull.points_m, axis=0).max() for body in bodies if body is not None]
-    for value, (least, most), what in (
-        (height, _CAMERA_HEIGHTS_M, "its cameras stand {0} m above the floor"),
-        (float(np.median(sizes)), _OBJECT_SIZES_M, "its objects are {0} m long"),
+def _implausible(evidence: Evidence, given: Given) -> Finding | None:
+    """Directions, heights and lengths that masks do not determine, but that are unusual."""
+    axis = int(np.abs(evidence.tops).argmax())
+    if abs(evidence.tops[axis]) > 0.5 and evidence.tops[1] <= 0.5:
+        return Finding("up", of_up(axis, float(np.sign(evidence.tops[axis])), given))
+    for what, value, bounds in (
+        ("the cameras stand", evidence.eye_m, _EYES_M),
+        ("the objects are", evidence.length_m, _LENGTHS_M),
     ):
-        if not least <= value <= most:
-            yield (
-                f"{what.format(f'{value:.3g}')} in the median, expected {least:g} to {most:g}: are "
-                "the poses in metres, and the floor where it should be?"
-            )
+        if value is not None and not bounds[0] <= value <= bounds[1]:
+            factor = _metres_per_unit(evidence) if given.posed else None
+            verb = "above the floor" if bounds == _EYES_M else "long"
+            sentence = of_unit(what, value, bounds, factor).replace(" m in", f" m {verb} in", 1)
+            return Finding(("unit", factor), sentence)
+    if evidence.floor_m is not None and abs(evidence.floor_m) > _FLOOR_M:
+        side = "above" if evidence.floor_m > 0 else "below"
+        cure = (
+            "correct or leave out floor_m, or --floor-m (the floor is then estimated)"
+            if given.posed
+            else "is the floor at y = 0?"
+        )
+        return Finding(
+            "floor",
+            f"the lowest objects end {abs(evidence.floor_m):.2f} m {side} the floor: {cure}",
+        )
+    return None
+
+
+def _metres_per_unit(evidence: Evidence) -> float | None:
+    """Unit of the poses in which furniture is about 0.9 m long; None if none makes it plausible."""
+    if evidence.length_m is None:
+        return None
+    lengths = {factor: evidence.length_m * factor for factor in UNITS_M.values()}
+    best = min(lengths, key=lambda factor: abs(np.log(lengths[factor] / 0.9)))
+    return best if 0.4 < lengths[best] < 2 else None
+
+
+def what_was_checked(evidence: Evidence) -> tuple[list[str], list[str]]:
+    """What the masks exclude about the cameras, and what they do not, as parts of sentences."""
+    fit, least = evidence.share(GIVEN), margin(evidence)
+
+    def excluded(causes: list[Cause]) -> bool:
+        enough = evidence.spare >= _SPARE_AT_LEAST
+        return enough and all(fit - evidence.share(cause) > least for cause in causes)
+
+    of: dict[str, list[Cause]] = {}
+    for cause in evidence.sums:
+        if "sorted" not in cause.detail:  # few frames are sorted in the same way
+            of.setdefault(cause.family, []).append(cause)
+    yes: list[str] = []
+    no: list[str] = []
+    for name, causes in (
+        ("matrices of another kind or with other axes", of.get("poses", [])),
+        ("poses of other frames", [*of.get("order", []), CHANCE]),
+        ("a principal point off by 30% of the picture",
+         [cause for cause in of.get("center", []) if max(map(abs, cause.shift)) > 0.2]),
+    ):  # fmt: skip
+        (yes if excluded(causes) else no).append(name)
+    focal = of.get("focal", [])
+    for step in sorted({abs(step) for step in FOCAL_STEPS}):
+        times = 2 ** (step / 6)
+        beyond = [cause for cause in focal if abs(np.log2(cause.factor)) > (step - 0.5) / 6]
+        if excluded(beyond):
+            yes.append(f"focal lengths {times:.2g} times as long or as short")
+            break
+    else:
+        no.append("wrong focal lengths")
+    return yes, no

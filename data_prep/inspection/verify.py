@@ -1,24 +1,29 @@
-"""Checks a folder of shards: checksums, shapes, ranges, boxes, masks and 3D ground truth."""
+"""Checks a folder of shards: checksums, shapes, ranges, boxes, masks, cameras and ground truth."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from data_prep.engine.source import SPLITS
 from data_prep.engine.workers import pool
-from data_prep.inspection.agreement import Agreement, compare
-from data_prep.inspection.bodies import found_bodies, true_bodies
-from data_prep.inspection.causes import Trial, try_repairs
+from data_prep.inspection.agreement import ROOM_SHARE, Agreement, compare
+from data_prep.inspection.bodies import true_bodies
 from data_prep.inspection.checks import array_problems, mask_problems, truth_problems
-from data_prep.inspection.verdicts import disagreement, room_problems
+from data_prep.inspection.evidence import Evidence, room_evidence, total
+from data_prep.inspection.given import Given, given_of
+from data_prep.inspection.tracking import Trial, add, try_tracks
+from data_prep.inspection.truth_causes import try_repairs
+from data_prep.inspection.truth_verdicts import ROOM_MASKS, disagreement, outliers
+from data_prep.inspection.verdicts import Finding, find_mistake
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError, ShardError
 from sceneprior.core.shard_writing import room_checksum
 from sceneprior.core.shards import Shard, list_shards, read_index
 
-_TRIED_ROOMS = 2
-"""Rooms per shard in which camera repairs are tried; the others likely have the same fault."""
+_TRIED_ROOMS = 3
+"""Rooms in which objects are found without ids, or repairs of the ground truth are tried."""
+_NAMED_ROOMS = 5
 
 
 @dataclass(frozen=True)
@@ -31,9 +36,12 @@ class RoomCheck:
     objects: int = 0
     problems: tuple[str, ...] = ()
     """Sentences without the room's name."""
+    evidence: Evidence | None = None
+    """Evidence about cameras and ids; None if the arrays are faulty."""
     agreement: Agreement = field(default_factory=Agreement)
-    trials: dict[str, Trial] = field(default_factory=dict)
-    """Results of repairs by cause, tried in some of the rooms that disagree."""
+    """Agreement of ground truth and masks."""
+    outliers: tuple[str, ...] = ()
+    """Views and objects that disagree with the ground truth, as sentences."""
     has_truth: bool = False
     has_checksum: bool = False
 
@@ -57,6 +65,12 @@ class FolderCheck:
         """Agreement summed over all rooms."""
         return sum((room.agreement for room in self.every), Agreement())
 
+    @property
+    def evidence(self) -> Evidence | None:
+        """Evidence of all rooms together; None if there is none."""
+        found = [room.evidence for room in self.every if room.evidence is not None]
+        return total(found) if found else None
+
 
 def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> FolderCheck:
     """Check the consistency of a folder of shards.
@@ -67,13 +81,14 @@ def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> Folder
     index = read_index(folder)
     name = str(index.get("label_set"))
     label_set(name)
-    problems: list[str] = []
+    usual, given, failures = given_of(folder, index.get("source"))
+    problems = [f"{folder}: {failures}."] if failures and room_id is None else []
     rooms: dict[str, list[RoomCheck]] = {}
     for split in SPLITS:
         if not any((folder / split).glob("*.h5")):
             continue
         paths = list_shards(folder, split)
-        arguments = [(folder, path, name, room_id) for path in paths]
+        arguments = [(folder, path, name, room_id, usual, given) for path in paths]
         with pool(workers) as run:
             rooms[split] = [room for part in run(_check_shard, arguments, f"checking {split}")
                             for room in part]  # fmt: skip
@@ -91,14 +106,84 @@ def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> Folder
             # Sentences about unreadable shards name their place themselves.
             text = sentence if sentence.startswith(path) else f"{where}: {sentence}"
             problems.append(text if text.endswith("?") else f"{text}.")
-    if room_id is None:
-        # Without a room's views, a problem already says what is missing.
-        if all(room.views for room in found.every):
-            problems += _count_problems(folder, index, rooms)
-        trials = [room.trials for room in found.every if room.trials]
-        for kind in found.agreement.failing():
-            problems.append(f"{folder}: {disagreement(found.agreement, kind, trials)}")
+    # Without a room's views, a problem already says what is missing.
+    if room_id is None and all(room.views for room in found.every):
+        problems += _count_problems(folder, index, rooms)
+    problems += _verdict(folder, found.every, usual, given)
     return replace(found, problems=tuple(problems))
+
+
+def _verdict(
+    folder: Path, rooms: Sequence[RoomCheck], usual: Given, given: dict[str, Given]
+) -> list[str]:
+    """One sentence about cameras and ids of all rooms, or about the rooms that differ; if the
+    masks show no mistake, sentences about the ground truth."""
+
+    def mistake(checks: Sequence[RoomCheck]) -> Finding | None:
+        known = [check.evidence for check in checks if check.evidence is not None]
+        if not known:
+            return None
+        origins = [given.get(check.room_id, usual) for check in checks]
+        names = [origin.file for origin in origins]
+        origin = origins[names.index(max(names, key=names.count))]
+        return find_mistake(total(known), origin, lambda: _tracks_of(folder, checks))
+
+    if (finding := mistake(rooms)) is not None:
+        return [f"{folder}: {finding.sentence}."]
+    of: dict[object, list[RoomCheck]] = {}
+    for room in rooms:
+        if (finding := mistake([room])) is not None:
+            of.setdefault(finding.key, []).append(room)
+    sentences = []
+    for checks in of.values():
+        finding = mistake(checks) or mistake(checks[:1])
+        assert finding is not None, "the first room alone has one"
+        named = ", ".join(check.room_id for check in checks[:_NAMED_ROOMS])
+        more = f" and {len(checks) - _NAMED_ROOMS} more" * (len(checks) > _NAMED_ROOMS)
+        which = "room" if len(checks) == 1 else f"{len(checks)} of {len(rooms)} rooms,"
+        sentences.append(f"{folder}, {which} {named}{more}: {finding.sentence}.")
+    return sentences or _truth_verdict(folder, rooms, usual, given)
+
+
+def _tracks_of(folder: Path, checks: Sequence[RoomCheck]) -> Trial:
+    most = sorted(checks, key=lambda check: -check.views)[:_TRIED_ROOMS]
+    trials = []
+    for check in most:
+        with Shard(folder / check.shard) as shard:
+            trials.append(try_tracks(shard.read_room(check.room_id, images=True)))
+    return add(trials)
+
+
+def _truth_verdict(
+    folder: Path, rooms: Sequence[RoomCheck], usual: Given, given: dict[str, Given]
+) -> list[str]:
+    """Sentences about ground truth and masks, in all rooms together or in single ones."""
+
+    def trials(checks: Sequence[RoomCheck]) -> list[Any]:
+        found = []
+        for check in checks[:_TRIED_ROOMS]:
+            with Shard(folder / check.shard) as shard:
+                views = shard.read_room(check.room_id, images=True)
+                bodies, _ = true_bodies(views, shard.read_ground_truth(check.room_id), folder)
+            found.append(try_repairs(bodies, views, given.get(check.room_id, usual)))
+        return found
+
+    sentences = []
+    wrong = [room for room in rooms if room.agreement.failing()]
+    if 2 * len(wrong) <= len(rooms):
+        for room in rooms:
+            kinds = room.agreement.failing(ROOM_SHARE, ROOM_MASKS)
+            tried = trials([room]) if kinds else []
+            said = [
+                disagreement(room.agreement, kind, tried, ROOM_SHARE, ROOM_MASKS) for kind in kinds
+            ]
+            where = f"{folder / room.shard}, room {room.room_id}"
+            sentences += [f"{where}: {sentence}." for sentence in said or room.outliers]
+    agreement = sum((room.agreement for room in rooms), Agreement())
+    if not sentences and (kinds := agreement.failing()):
+        tried = trials(wrong)
+        sentences = [f"{folder}: {disagreement(agreement, kind, tried)}." for kind in kinds]
+    return [text.replace("?.", "?") for text in sentences]
 
 
 def _count_problems(
@@ -121,7 +206,12 @@ def _count_problems(
 
 
 def _check_shard(
-    folder: Path, path: Path, label_set_name: str, only: str | None
+    folder: Path,
+    path: Path,
+    label_set_name: str,
+    only: str | None,
+    usual: Given,
+    given: dict[str, Given],
 ) -> list[RoomCheck]:
     """Check every room of a shard, or only `only`; an unreadable shard is one problem."""
     name = str(path.relative_to(folder))
@@ -133,14 +223,14 @@ def _check_shard(
                 checks.append(RoomCheck(name, "", problems=(f"{said} '{label_set_name}'",)))
             for room_id in shard.room_ids:
                 if only is None or room_id == only:
-                    left = _TRIED_ROOMS - sum(bool(check.trials) for check in checks)
-                    checks.append(_check_room(shard, folder, name, room_id, left > 0))
+                    origin = given.get(room_id, usual)
+                    checks.append(_check_room(shard, folder, name, room_id, origin))
     except ShardError as error:
         checks.append(RoomCheck(name, "", problems=(str(error).removesuffix("."),)))
     return checks
 
 
-def _check_room(shard: Shard, folder: Path, name: str, room_id: str, try_causes: bool) -> RoomCheck:
+def _check_room(shard: Shard, folder: Path, name: str, room_id: str, given: Given) -> RoomCheck:
     truth = None
     try:
         views = shard.read_room(room_id, images=True)
@@ -163,14 +253,12 @@ def _check_room(shard: Shard, folder: Path, name: str, room_id: str, try_causes:
     )  # fmt: skip
     if wrong:
         return check
+    check = replace(check, evidence=room_evidence(views, given.convention, truth is None))
     if truth is None:
-        bodies = found_bodies(views)
-    else:
-        bodies, found = true_bodies(views, truth, folder)
-        problems += found
+        return check
+    bodies, found = true_bodies(views, truth, folder)
     seen = compare(bodies, views)
-    trials = {}
-    if try_causes and seen.agreement.failing():
-        trials = try_repairs(bodies, views)
-    problems += room_problems(bodies, views, seen, [trials] if trials else [])
-    return replace(check, problems=tuple(problems), agreement=seen.agreement, trials=trials)
+    odd = () if seen.agreement.failing(ROOM_SHARE, ROOM_MASKS) else outliers(bodies, views, seen)
+    return replace(
+        check, problems=(*problems, *found), agreement=seen.agreement, outliers=tuple(odd)
+    )

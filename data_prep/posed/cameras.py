@@ -37,9 +37,10 @@ def upright_cameras(
     upright = turn @ poses
     spread = np.ptp(upright[:, :3, 3], axis=0).max()
     if spread > _LARGEST_SPREAD_M:
+        unit = "0.01, if they are in centimetres" if spread < 3000 else "0.001, in millimetres"
         raise InputError(
-            f"{recording.path}: its cameras are spread over {spread:.0f} m; is "
-            "metres_per_unit wrong?"
+            f"{recording.path}: its cameras are spread over {spread:.0f} m; is metres_per_unit "
+            f"wrong? Pass --metres-per-unit {unit}."
         )
     return upright @ GL_TO_CV, turn
 
@@ -78,7 +79,7 @@ def cameras_in_room(
     if low[1] <= floor:
         raise InputError(
             f"{recording.path}: its lowest camera is at {low[1]:.2f} m, below the floor at "
-            f"{floor:.2f} m; check floor_m, metres_per_unit and --up."
+            f"{floor:.2f} m: {_why_below(recording, turn)}"
         )
     middle = (low[0] + high[0]) / 2, (low[2] + high[2]) / 2
     if recording.floor_center_m is not None:
@@ -96,6 +97,24 @@ def cameras_in_room(
     room_from_upright = np.eye(4)
     room_from_upright[:3, 3] = -middle[0], -floor, -middle[1]
     return room_cameras(upright, room_from_upright)
+
+
+def _why_below(recording: Recording, turn: np.ndarray) -> str:
+    """Likely reason why cameras are below the floor, as the end of a sentence."""
+    written = np.stack([frame.camera_to_world for frame in recording.frames])
+    written = written[is_pose(written)]
+    axis = int(np.abs(turn[1, :3]).argmax())
+    # The sideways axis of an upright camera is level: it has no part along the axis up.
+    level, level_if_inverted = np.abs(written[:, axis, 0]), np.abs(written[:, 0, axis])
+    if level_if_inverted.mean() < 0.5 * level.mean():
+        return "the matrices seem to be world-to-camera: invert each."
+    other = seems_up(recording)
+    if level.mean() > 0.2 and other is not None and "xyz"[axis] != other:
+        return f"the tops of the pictures point along {other}: pass --up {other}."
+    return (
+        "are the last columns of the matrices translations from world to camera, not positions "
+        "(-R t)? Else check floor_m, metres_per_unit and --up."
+    )
 
 
 def seems_up(recording: Recording) -> str | None:

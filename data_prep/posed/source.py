@@ -128,6 +128,11 @@ class PosedSource:
             recordings.append(recording)
         settings, count = self.posed_settings, len(recordings)
         sentences = []
+        if single := sum(len(recording.frames) < 2 for recording in recordings):
+            sentences.append(
+                f"{single} of {count} rooms have one frame, which shows no depth: objects are "
+                "lifted to 3D from at least two views, better twenty."
+            )
         if untracked and settings.tracks != "auto":
             sentences.append(
                 f"In {len(untracked)} of {count} rooms ids belong to single images "

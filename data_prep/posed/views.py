@@ -131,7 +131,12 @@ def prepare_posed(
     if stuff.any():
         small = (..., *thinned(stuff_step(views.image_size)))
         views = replace(views, stuff=stuff[small] * (seen.instance_ids[small] == 0))
-    return PreparedRoom(views, notes=tuple(notes))
+    room_from_world = np.linalg.inv(upright[0] @ world_to_camera[0]) @ turn
+    origin = {
+        "file": recording.path.relative_to(recording.folder).as_posix(),
+        "room_from_world": room_from_world.round(9).tolist(),
+    }
+    return PreparedRoom(views, notes=tuple(notes), cameras=origin)
 
 
 def _check_tracked(images: np.ndarray, void: int) -> None:

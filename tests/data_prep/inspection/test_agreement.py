@@ -9,7 +9,7 @@ from front_jobs import front_job, rooms_of
 
 from data_prep.engine.build import build_shards
 from data_prep.inspection.agreement import MARGIN, Agreement, Tally, compare, compare_boxes
-from data_prep.inspection.bodies import found_bodies, hull_of_model, true_bodies
+from data_prep.inspection.bodies import hull_of_model, true_bodies
 from sceneprior.core.errors import ShardError
 
 LARGER = ("views.image_size=[180, 240]", "views.per_m2=2")
@@ -54,17 +54,6 @@ def test_without_meshes_the_boxes_stand_for_them(made):
     # These pieces are boxes themselves, though some are turned in theirs.
     tally = compare(bodies, views).agreement.of("box")
     assert problems == [] and tally.share == 1.0 and tally.mean_iou > 0.85
-
-
-def test_without_truth_boxes_are_found_from_the_masks(made):
-    bodies = found_bodies(made[0])
-    tally = compare(bodies, made[0]).agreement.of("found")
-    assert tally.mean_iou > 0.85 and tally.share > 0.8
-    true, _ = true_bodies(*made)
-    for body, right in zip(bodies, true, strict=True):
-        low, high = body.hull.points_m.min(axis=0), body.hull.points_m.max(axis=0)
-        np.testing.assert_allclose(low, right.hull.points_m.min(axis=0), atol=0.2)
-        np.testing.assert_allclose(high, right.hull.points_m.max(axis=0), atol=0.2)
 
 
 def test_what_is_undefined_disagrees_and_the_margin_is_what_it_says(made):

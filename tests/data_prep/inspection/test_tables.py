@@ -75,4 +75,8 @@ def test_verify_says_what_it_could_not_check(shards, cli):
     said = " ".join(cli("inspect", shards, "--verify").stdout.split())
     assert "6 rooms carry no checksum (shards of an earlier release)" in said
     # Nothing is seen whole, and all the same every mask lies within its projection.
-    assert said.endswith("masks lie within their projected meshes.") and "100.0% of " in said
+    assert "masks lie within their projected meshes; " in said and "100.0% of " in said
+    assert "not excluded: matrices of another kind or with other axes, " in said
+    assert said.endswith(
+        "wrong focal lengths (0 measurements to spare; too few views show whole objects)."
+    )

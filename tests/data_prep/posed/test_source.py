@@ -167,7 +167,7 @@ def test_the_command(rooms, tmp_path, cli):
     assert looked.exit_code == 0 and "unknown" in looked.stdout, looked.output
     checked = cli("inspect", tmp_path / "shards", "--verify")
     assert checked.exit_code == 0, checked.output
-    assert "masks lie within their projected boxes found from the masks" in checked.stdout
+    assert "nothing wrong is found, but little is checked. " in " ".join(checked.stdout.split())
     rooms[2].png(0).unlink()
     again = cli(
         "prep-posed", tmp_path / "rooms", "--out", tmp_path / "shards", "--label-set", SET,

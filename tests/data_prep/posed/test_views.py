@@ -176,7 +176,7 @@ def test_nothing_of_the_label_set(room):
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"floor_m": 1.55}, r"lowest camera is at 1\.50 m, below the floor at 1\.55 m; check"),
+        ({"floor_m": 1.55}, r"lowest camera is at 1\.50 m, below the floor at 1\.55 m: are the last c"),
         ({"metres_per_unit": 100}, r"cameras are spread over 480 m; is metres_per_unit wrong\?"),
         ({"w": 100}, r"masks are 128 x 96 pixels but the colour frames 100 x 96: with different"),
     ],
@@ -201,7 +201,11 @@ def test_no_usable_frame(room):
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        (lambda pose: pose @ np.diag([1.0, 1, -1, 1]), "it is left-handed, a mirror."),
+        (
+            lambda pose: pose @ np.diag([1.0, 1, -1, 1]),
+            "it is left-handed, as of Unity or Unreal, or mirrored: negate one row of all matrices "
+            "to make their world right-handed.",
+        ),
         (lambda pose: pose * np.nan, "it holds NaN or infinity."),
         (lambda pose: pose.T, "it is transposed: its translation is in the last row."),
         (lambda pose: pose @ np.diag([3.0, 3, 3, 1]), "its axes have the length 3, expected 1."),

@@ -1,0 +1,123 @@
+"""Evidence of one room for and against each mistake, from its masks and cameras alone."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import rankdata
+
+from data_prep.inspection.causes import GIVEN, Cause, Convention, corrected
+from data_prep.inspection.triangulation import Middles, fit, middles
+from data_prep.posed.floor import find_floor
+from sceneprior.core.shards import RoomViews
+
+_LEAST_VIEWS = 5
+"""Views from which on the order of frames can be compared."""
+
+_SAME_FLOOR_M = 0.1
+
+
+class Evidence(NamedTuple):
+    """Evidence of one room."""
+
+    sums: dict[Cause, float]
+    """Agreement of middles with cameras (`fit`), summed, after the correction of each cause."""
+    rooms: int
+    middles: int
+    spare: int
+    """Middles beyond those that the objects' points take."""
+    views: int
+    ids: int
+    masks: int
+    once: int
+    """Ids that are in one view only."""
+    nearness: float | None
+    """Rank correlation, over pairs of views, of the pixels on the same objects and the angle
+    between the cameras, negated: about 0 if poses belong to other frames. None for few views."""
+    tops: tuple[float, float, float]
+    """Mean direction of the tops of the pictures in the room frame; y should be up."""
+    eye_m: float
+    """Median height of the cameras."""
+    length_m: float | None
+    """Median length of the objects; None without any."""
+    floor_m: float | None
+    """Height at which the lowest objects end (`find_floor`)."""
+
+    def share(self, cause: Cause) -> float:
+        """Mean agreement in [0, 1] after a correction."""
+        return self.sums.get(cause, 0.0) / max(self.middles, 1)
+
+
+def room_evidence(views: RoomViews, convention: Convention, floor: bool = True) -> Evidence:
+    """Compare the masks of one room, read with images, with its cameras as they are and corrected.
+
+    `floor` asks for the height of the floor, which takes longer than all else.
+    """
+    found, cameras = middles(views), corrected(views, convention)
+    agreement, depth = fit(found, *map(np.stack, zip(*cameras.values(), strict=True)))
+    sums = dict(zip(cameras, agreement.sum(axis=1).tolist(), strict=True))
+    poses, lenses = cameras[GIVEN]
+    turns = poses[:, :3, :3]
+    eyes = -(turns.swapaxes(1, 2) @ poses[:, :3, 3:])[..., 0]
+    level = find_floor(views, poses, lenses) if floor else None  # type: ignore[arg-type]
+    shown = views.visible.sum(axis=0)
+    x, y, z = (-turns[:, 1]).mean(axis=0).tolist()
+    return Evidence(
+        sums, 1, len(found.item), found.spare, len(views.visible), int((shown > 0).sum()),
+        int(shown.sum()), int((shown == 1).sum()), _nearness(views), (x, y, z),
+        float(np.median(eyes[:, 1])), _length(found, depth[0], lenses),
+        None if level is None else level[0],
+    )  # fmt: skip
+
+
+def total(rooms: list[Evidence]) -> Evidence:
+    """Evidence of several rooms together: sums of counts, medians or means of the others."""
+    causes = {cause: None for room in rooms for cause in room.sums}
+    sums = {cause: sum(room.sums.get(cause, 0.0) for room in rooms) for cause in causes}
+    names = ("rooms", "middles", "spare", "views", "ids", "masks", "once")
+    counts = {name: sum(getattr(room, name) for room in rooms) for name in names}
+    x, y, z = np.mean([room.tops for room in rooms], axis=0).tolist()
+    nearness, length, floor = (
+        [value for room in rooms if (value := getattr(room, name)) is not None]
+        for name in ("nearness", "length_m", "floor_m")
+    )
+    return Evidence(
+        sums,
+        **counts,
+        nearness=float(np.mean(nearness)) if nearness else None,
+        tops=(x, y, z),
+        eye_m=float(np.median([room.eye_m for room in rooms])),
+        length_m=float(np.median(length)) if length else None,
+        floor_m=_usual(floor, len(rooms)),
+    )
+
+
+def _usual(floors: list[float], rooms: int) -> float | None:
+    """Median height of the floors found; None if few are found, or if they differ."""
+    if not floors:
+        return None
+    middle = float(np.median(floors))
+    same = sum(abs(floor - middle) < _SAME_FLOOR_M for floor in floors)
+    return middle if same >= min(rooms, 2) and 3 * same >= 2 * len(floors) else None
+
+
+def _nearness(views: RoomViews) -> float | None:
+    """See `Evidence.nearness` (the statistic of Mantel, Cancer Research 1967, on ranks)."""
+    if len(views.visible) < _LEAST_VIEWS:
+        return None
+    turns = views.world_to_camera[:, :3, :3].astype(np.float64)
+    cosines = np.einsum("aij,bij->ab", turns, turns)  # of the angle, times 2, plus 1
+    pixels = views.mask_pixels * views.visible
+    parts = pixels / np.maximum(pixels.sum(axis=1, keepdims=True), 1)
+    shared = np.minimum(parts[:, None], parts[None]).sum(axis=-1)
+    pairs = np.triu_indices(len(turns), 1)
+    ranks = np.stack([rankdata(cosines[pairs].round(6)), rankdata(shared[pairs].round(6))])
+    if (np.ptp(ranks, axis=1) == 0).any():
+        return None
+    return float(np.corrcoef(ranks)[0, 1])
+
+
+def _length(found: Middles, depth: np.ndarray, lenses: np.ndarray) -> float | None:
+    sizes_m = found.extent_px * depth / lenses[found.view, found.axis, found.axis]
+    lengths = [sizes_m[found.item == k].max() for k in np.unique(found.item)]
+    lengths = [length for length in lengths if length > 0]
+    return float(np.median(lengths)) if lengths else None
