@@ -1,14 +1,17 @@
 """Time of a training step of the layout stage, in this package and in the authors' way.
 
-Run `python benchmarks/bench_layout_step.py`. A step is forward, losses, backward and Adam at the
-paper's size (configs/paper/bedroom.yaml: width 512, 13 objects, 22 classes; 128 rooms of 20 views)
-on the CPU.
+    python benchmarks/bench_layout_step.py [--rooms 128] [--objects 13]
+
+A step is forward, losses, backward and Adam at the paper's size (configs/paper/bedroom.yaml: width
+512, 13 objects, 22 classes; 20 views per room) on the CPU.
 
 `theirs` projects the 2,562 vertices of an icosphere for every object, and computes boxes, matching
 and losses room by room in a Python loop. Both variants use this package's decoder, losses and
 optimiser, and `theirs` runs the backward pass room by room, which saves memory; both choices are in
-its favour. The variants take turns, so that other load affects both; values are medians. On a busy
-machine, rely on CPU time with one thread (OMP_NUM_THREADS=1).
+its favour. `plain` is our step with the transformer of tests/references/scene_decoder.py, in plain
+layers. `products_s` is the time that the matrix products of our step alone would take at the rate
+of a large product. The variants take turns, so that other load affects all; values are medians. On
+a busy machine, rely on CPU time with one thread (OMP_NUM_THREADS=1).
 """
 
 import argparse
@@ -16,15 +19,18 @@ import json
 import os
 import platform
 import statistics
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
+from unittest import mock
 
 import torch
 from bench_boxes import SIZE, make_batch
 from torch import Tensor
+from torch.utils.flop_counter import FlopCounterMode
 
 from sceneprior.apps.config import load_config
 from sceneprior.core.geometry.cameras import MIN_DEPTH_M, Boxes2D, project
@@ -34,6 +40,9 @@ from sceneprior.paper.config import PaperConfig
 from sceneprior.paper.prior import ScenePrior
 from sceneprior.paper.view_loss import match_and_score, proxy_boxes
 from sceneprior.training.steps import weighted_sum
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from references.scene_decoder import unroll
 
 CLASSES = 22
 CONFIG = Path(__file__).parents[1] / "configs" / "paper/bedroom.yaml"
@@ -79,6 +88,14 @@ def our_step(prior: ScenePrior, z: Tensor, views: SceneViews, config: PaperConfi
     weighted_sum(losses, config.loss).backward()
 
 
+def plain_step(prior: ScenePrior, z: Tensor, views: SceneViews, config: PaperConfig) -> None:
+    def forward(z: Tensor, objects: int, _: Tensor | None) -> Tensor:
+        return unroll(prior.decoder, z, objects)
+
+    with mock.patch.object(prior.decoder, "forward", forward):
+        our_step(prior, z, views, config)
+
+
 def their_boxes(points_m: Tensor, views: SceneViews) -> Boxes2D:
     """`boxes_of_points` with an autograd graph through every point."""
     height, width = views.image_size
@@ -110,11 +127,23 @@ def their_step(prior: ScenePrior, z: Tensor, views: SceneViews, config: PaperCon
 Step = Callable[[ScenePrior, Tensor, SceneViews, PaperConfig], None]
 
 
-def step_ratio(rooms: int = 128, views: int = 20, repeats: int = 5) -> dict[str, float]:
-    """Median wall-clock and CPU seconds of both variants, and their ratios."""
-    config = load_config(str(CONFIG))
+def product_rate(repeats: int = 20) -> float:
+    """Floating-point operations per second of a large matrix product: the fastest of several."""
+    a, b = torch.randn(1456, 512), torch.randn(512, 1024)
+    seconds = []
+    for _ in range(repeats):
+        start = time.process_time()
+        a @ b
+        seconds.append(time.process_time() - start)
+    return 2 * a.numel() * b.shape[1] / min(seconds)
+
+
+def step_ratio(
+    rooms: int = 128, views: int = 20, objects: int = 13, repeats: int = 5
+) -> dict[str, float]:
+    """Median wall-clock and CPU seconds of all variants, and their ratios."""
+    config = load_config(str(CONFIG), (f"model.max_objects={objects}",))
     assert isinstance(config, PaperConfig)
-    objects = config.model.max_objects
     batch = make_views(rooms, views, objects)
     prior = config.build_prior()
     logits = torch.randn(rooms, config.model.logits_per_room, requires_grad=True)
@@ -127,24 +156,33 @@ def step_ratio(rooms: int = 128, views: int = 20, repeats: int = 5) -> dict[str,
         optimizer.step()
         return time.perf_counter() - start, time.process_time() - used
 
-    times = [(*seconds(our_step), *seconds(their_step)) for _ in range(repeats + 1)][1:]
-    ours, ours_cpu, theirs, theirs_cpu = map(statistics.median, zip(*times, strict=True))
-    return {
-        "ours_s": ours, "theirs_s": theirs, "ratio": theirs / ours,
-        "ours_cpu_s": ours_cpu, "theirs_cpu_s": theirs_cpu, "ratio_cpu": theirs_cpu / ours_cpu,
-    }  # fmt: skip
+    steps = {"ours": our_step, "plain": plain_step, "theirs": their_step}
+    times = [[seconds(step) for step in steps.values()] for _ in range(repeats + 1)][1:]
+    clock, used = (
+        {name: statistics.median(turn[i][kind] for turn in times) for i, name in enumerate(steps)}
+        for kind in (0, 1)
+    )
+    with FlopCounterMode(display=False) as counter:
+        our_step(prior, prior.latent_space(logits), batch, config)
+    found = {"products_s": counter.get_total_flops() / product_rate()}
+    for name in steps:
+        found |= {f"{name}_s": clock[name], f"{name}_cpu_s": used[name]}
+        found |= {f"{name}_ratio": clock[name] / clock["ours"]}
+        found |= {f"{name}_ratio_cpu": used[name] / used["ours"]}
+    return found
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--rooms", type=int, default=128)
+    parser.add_argument("--objects", type=int, default=13)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--json", type=Path, help="write the numbers to this file, too")
     options = parser.parse_args()
     print(f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, ", end="")
     print(f"torch {torch.__version__} on {torch.get_num_threads()} threads")
-    result = step_ratio(options.rooms, repeats=options.repeats)
+    result = step_ratio(options.rooms, objects=options.objects, repeats=options.repeats)
     for name, value in result.items():
-        print(f"{name:12} {value:8.3f}")
+        print(f"{name:16} {value:8.3f}")
     if options.json:
         options.json.write_text(json.dumps(result, indent=2) + "\n")

@@ -1,5 +1,6 @@
 """The permutation-invariant transformer: object features x_k from z (section 3.2, Eq. 3 and 4)."""
 
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import torch
@@ -10,6 +11,9 @@ from torch.nn import functional as F
 
 from sceneprior.paper.layers import DecoderConfig, dropout
 from sceneprior.paper.released import QuerySelfAttention, StepOutputs
+from sceneprior.paper.repeated_linear import RepeatedLinear
+
+Layer = Callable[[Tensor], Tensor]
 
 
 class TransformerConfig(DecoderConfig):
@@ -46,10 +50,16 @@ class FeedForward(nn.Module):
         self.norm = nn.LayerNorm(width)
         self.dropout = dropout
 
-    def forward(self, x: Float[Tensor, "*batch width"]) -> Float[Tensor, "*batch width"]:
+    def repeated(self, rows: Sequence[int]) -> Layer:
+        """The function, for several inputs one after the other, of so many rows each."""
+        expand, contract = (repeated(layer, rows) for layer in (self.expand, self.contract))
         p = self.dropout if self.training else 0.0
-        inner = dropout(F.gelu(self.expand(x)), p)
-        return self.norm(x + dropout(self.contract(inner), p))
+
+        def forward(x: Tensor) -> Tensor:
+            inner = dropout(F.gelu(expand(x)), p)
+            return self.norm(x + dropout(contract(inner), p))
+
+        return forward
 
 
 class SceneTransformer(nn.Module):
@@ -65,11 +75,14 @@ class SceneTransformer(nn.Module):
     the scene context F_k; one decoder layer attends to it with z as the query. Both layers apply
     the norm after the residual connection, as in the library that the paper builds on.
 
-    Two shortcuts save time and are exact. Encoder: an object's query, key and value do not change,
-    so each is computed once and appended; only the attention is recomputed in each step, since
-    earlier objects also attend to later ones. Decoder: all steps share the one query z, so instead
-    of projecting every context token to a key and a value, z's query is multiplied by the key
-    projection once, and the value projection is applied to the single weighted sum. `width` is D_z.
+    Three shortcuts save time and are exact. Encoder: an object's query, key and value do not
+    change, so each is computed once and appended, the value already multiplied by each head's share
+    of the output projection. Attention and all that follows it are computed again in each step,
+    since earlier objects also attend to later ones: its time grows with the square of the number of
+    objects. Decoder: all steps share the one query z, so instead of projecting every context token
+    to a key and a value, z's query is multiplied by the key projection once, and the value
+    projection is applied to the single weighted sum. Gradients: those of the weights are one
+    product over all steps (`RepeatedLinear`). `width` is D_z.
     """
 
     def __init__(self, width: int, config: TransformerConfig, max_objects: int):
@@ -116,20 +129,25 @@ class SceneTransformer(nn.Module):
     def _unroll(self, z: Tensor, going_on: list[int]) -> Tensor:
         """Object features; step k computes only the first `going_on[k]` rooms and leaves zeros
         elsewhere."""
+        read, encode = self._reader(going_on), self._encoder(going_on)
+        decode = self._decoder(going_on)
         query = self._query(z)
-        tokens = self.start.expand(len(z), 1, -1)
-        qkv = self._split(self.encoder_qkv(tokens))
         key_query = self._key_query(query)
+        newest = self.start.expand(len(z), -1)
+        known: list[Tensor] = []
         features: list[Tensor] = []
-        for rooms in going_on:
-            query, key_query, tokens = (_first(each, rooms) for each in (query, key_query, tokens))
-            qkv = [_first(part, rooms) for part in qkv]
-            if features:
-                newest = _first(features[-1], rooms).unsqueeze(1)
-                tokens = torch.cat([tokens, newest], dim=1)
-                added = self._split(self.encoder_qkv(newest))
-                qkv = [torch.cat(both, dim=2) for both in zip(qkv, added, strict=True)]
-            features.append(self._next(query, key_query, tokens, qkv))
+        for step, rooms in enumerate(going_on):
+            query, key_query, newest, *known = (
+                _first(each, rooms) for each in (query, key_query, newest, *known)
+            )
+            added = read(newest)
+            if known:
+                added = [torch.cat(both, dim=-2) for both in zip(known, added, strict=True)]
+            known = added
+            newest = decode(query, key_query, encode(*known))
+            if self.output is not None:
+                newest = self.output(newest, step)
+            features.append(newest)
         return torch.stack([F.pad(x, (0, 0, 0, len(z) - len(x))) for x in features], dim=1)
 
     def _query(self, z: Tensor) -> Tensor:
@@ -141,18 +159,47 @@ class SceneTransformer(nn.Module):
         """
         return self.query(z * z.shape[-1] ** 0.5)
 
-    def _next(
-        self, z_query: Tensor, key_query: Tensor, tokens: Tensor, qkv: list[Tensor]
-    ) -> Tensor:
-        query, key, value = qkv
-        # Attention is written out: on a dozen tokens torch's fused CPU attention is slower.
-        scores = query @ key.transpose(-1, -2) / query.shape[-1] ** 0.5
-        mixed = (self._drop(scores.softmax(dim=-1)) @ value).transpose(1, 2).flatten(2)
-        context = self.encoder_norm(tokens + self._drop(self.encoder_out(mixed)))
-        context = self.encoder_end(self.encoder_ff(context))
-        x = z_query + self._drop(self.decoder_out(self._cross_attend(key_query, context)))
-        x = self.decoder_end(self.decoder_ff(self.decoder_norm(x)))
-        return x if self.output is None else self.output(x, step=tokens.shape[1] - 1)
+    def _reader(self, rows: Sequence[int]) -> Callable[[Tensor], list[Tensor]]:
+        """The function that makes a token of the newest object x_k: (rooms, 1, width) the token,
+        and (rooms, heads, 1, *) its queries, keys, and values times the output projection."""
+        project = repeated(self.encoder_qkv, rows)
+        output = self.encoder_out.weight.T.unflatten(0, (self.heads, -1))
+        projected = RepeatedLinear(output, None, rows)
+
+        def read(x: Tensor) -> list[Tensor]:
+            query, key, value = project(x).unflatten(-1, (3, self.heads, -1)).unbind(1)
+            value = projected(value.transpose(0, 1)).transpose(0, 1)
+            return [x.unsqueeze(1), *(part.unsqueeze(2) for part in (query, key, value))]
+
+        return read
+
+    def _encoder(self, rows: Sequence[int]) -> Callable[..., Tensor]:
+        """The function from all tokens that `read` made to the scene context F_k."""
+        feed_forward = self.encoder_ff.repeated([k * rooms for k, rooms in enumerate(rows, 1)])
+
+        def encode(tokens: Tensor, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
+            # Attention is written out: on a dozen tokens torch's fused CPU attention is slower.
+            scores = query @ key.transpose(-1, -2) / query.shape[-1] ** 0.5
+            shares = self._drop(scores.softmax(dim=-1)).transpose(1, 2).flatten(2)
+            mixed = torch.baddbmm(self.encoder_out.bias, shares, value.flatten(1, 2))
+            context = self.encoder_norm(tokens + self._drop(mixed))
+            return self.encoder_end(feed_forward(context))
+
+        return encode
+
+    def _decoder(self, rows: Sequence[int]) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
+        """The function from z's queries and the context F_k to the next object x_k."""
+        value = self.decoder_value.weight.unflatten(0, (self.heads, -1)).transpose(1, 2)
+        values = RepeatedLinear(value, self.decoder_value.bias.view(self.heads, -1), rows)
+        out, feed_forward = repeated(self.decoder_out, rows), self.decoder_ff.repeated(rows)
+
+        def decode(z_query: Tensor, key_query: Tensor, context: Tensor) -> Tensor:
+            weights = self._drop((key_query @ context.transpose(1, 2)).softmax(dim=-1))
+            mixed = values((weights @ context).transpose(0, 1)).transpose(0, 1).flatten(1)
+            x = z_query + self._drop(out(mixed))
+            return self.decoder_end(feed_forward(self.decoder_norm(x)))
+
+        return decode
 
     def _key_query(self, z_query: Tensor) -> Tensor:
         """(rooms, heads, width): each head's query from z, multiplied by the key projection.
@@ -164,20 +211,6 @@ class SceneTransformer(nn.Module):
         key = self.decoder_key.unflatten(0, (self.heads, -1))
         return torch.einsum("rhd,hdw->rhw", query, key) / query.shape[-1] ** 0.5
 
-    def _cross_attend(self, key_query: Tensor, context: Tensor) -> Tensor:
-        """(rooms, width): the values of the context F_k, weighted per head by z's attention."""
-        weights = self._drop((key_query @ context.transpose(1, 2)).softmax(dim=-1))
-        summed = (weights @ context).transpose(0, 1)
-        value = self.decoder_value.weight.unflatten(0, (self.heads, -1))
-        values = torch.baddbmm(
-            self.decoder_value.bias.view(self.heads, 1, -1), summed, value.transpose(1, 2)
-        )
-        return values.transpose(0, 1).flatten(1)
-
-    def _split(self, packed: Tensor) -> list[Tensor]:
-        shape = (*packed.shape[:2], 3, self.heads, packed.shape[-1] // 3 // self.heads)
-        return list(packed.reshape(shape).permute(2, 0, 3, 1, 4).unbind(0))
-
     def _drop(self, x: Tensor) -> Tensor:
         return dropout(x, self.dropout if self.training else 0.0)
 
@@ -186,3 +219,9 @@ def _first(values: Tensor, rooms: int) -> Tensor:
     """`values[:rooms]`; `values` itself if it has no more rooms, since a slice copies the gradient
     in the backward pass."""
     return values if len(values) == rooms else values[:rooms]
+
+
+def repeated(layer: nn.Linear, rows: Sequence[int]) -> Layer:
+    """The layer, for several inputs one after the other, of so many rows each."""
+    product = RepeatedLinear(layer.weight.T.unsqueeze(0), layer.bias.unsqueeze(0), rows)
+    return lambda x: product(x.flatten(0, -2).unsqueeze(0)).view(*x.shape[:-1], layer.out_features)

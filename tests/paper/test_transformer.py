@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from references.scene_decoder import next_object, next_object_loop
+from references.scene_decoder import next_object, next_object_loop, unroll
 from torch.nn import functional as F
 from torch.testing import assert_close
 
@@ -77,6 +77,39 @@ def test_the_slow_twin_says_the_same(torch_rng):
         assert_close(next_object(model, z, previous), by_hand, rtol=0, atol=1e-12)
         first = next_object_loop(model, z, previous[:, :0], key_bias)
         assert_close(model(z, 1)[:, 0], first, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-5)])
+def test_a_training_step_has_the_gradients_of_plain_layers(torch_rng, dtype, tolerance):
+    model = decoder(dtype, dropout=0.1).train()
+    z, weights = inputs(torch_rng, dtype)
+    z.requires_grad_()
+    parameters = dict(model.named_parameters()) | {"z": z}
+    found = []
+    for features in (lambda: model(z, 6), lambda: unroll(model, z, 6)):
+        torch.manual_seed(3)  # both set the same values to zero
+        x = features()
+        gradients = torch.autograd.grad((x * weights).sum(), list(parameters.values()))
+        found.append((x.detach(), dict(zip(parameters, gradients, strict=True))))
+    (ours, own), (plain, wanted) = found
+    assert_close(ours, plain, rtol=0, atol=10 * TOLERANCE[dtype])
+    for name, gradient in wanted.items():
+        scale = float(gradient.norm())
+        # ... up to rounding, relative to the whole gradient of the parameter.
+        assert float((own[name] - gradient).norm()) <= tolerance * max(scale, 1), name
+
+
+def test_rooms_that_need_fewer_objects_have_the_same_gradients(torch_rng):
+    model = decoder(torch.float64).eval()
+    z, weights = inputs(torch_rng, rooms=4)
+    needed = torch.tensor([2, 6, 0, 3])
+    taken = (torch.arange(6) < needed[:, None]).unsqueeze(-1)
+    parameters = list(model.parameters())
+    found, wanted = (
+        torch.autograd.grad((features * weights * taken).sum(), parameters)
+        for features in (model(z, 6, needed), unroll(model, z, 6))
+    )
+    assert_close(found, wanted, rtol=0, atol=1e-11)
 
 
 def test_every_weight_has_a_gradient_that_gradcheck_confirms(torch_rng):

@@ -1,16 +1,70 @@
-"""The transformer one room, one token and one head at a time: as the supplement describes it."""
+"""The transformer in plain layers, and one room, one token and one head at a time, as in the
+supplement."""
 
 import math
 
 import torch
+from torch.nn import functional as F
+
+from sceneprior.paper.layers import dropout
+
+
+def unroll(model, z, objects):
+    """The features of a SceneTransformer in evaluation or training, where it draws the same zeros.
+
+    Each step uses `torch.nn`'s layers, so autograd adds up the gradients of their weights.
+    """
+    query = model._query(z)
+    tokens = model.start.expand(len(z), 1, -1)
+    qkv = _split(model, model.encoder_qkv(tokens))
+    key_query = model._key_query(query)
+    features = []
+    for _ in range(objects):
+        if features:
+            newest = features[-1].unsqueeze(1)
+            tokens = torch.cat([tokens, newest], dim=1)
+            added = _split(model, model.encoder_qkv(newest))
+            qkv = [torch.cat(both, dim=2) for both in zip(qkv, added, strict=True)]
+        features.append(_next(model, query, key_query, tokens, qkv))
+    return torch.stack(features, dim=1)
 
 
 def next_object(model, z, previous):
     """The feature that a SceneTransformer says follows a set of objects, in whatever order."""
     query = model._query(z)
     tokens = torch.cat([model.start.expand(len(z), 1, -1), previous], dim=1)
-    qkv = model._split(model.encoder_qkv(tokens))
-    return model._next(query, model._key_query(query), tokens, qkv)
+    qkv = _split(model, model.encoder_qkv(tokens))
+    return _next(model, query, model._key_query(query), tokens, qkv)
+
+
+def _next(model, z_query, key_query, tokens, qkv):
+    query, key, value = qkv
+    scores = query @ key.transpose(-1, -2) / query.shape[-1] ** 0.5
+    mixed = (_drop(model, scores.softmax(dim=-1)) @ value).transpose(1, 2).flatten(2)
+    context = model.encoder_norm(tokens + _drop(model, model.encoder_out(mixed)))
+    context = model.encoder_end(_feed_forward(model.encoder_ff, context))
+    weights = _drop(model, (key_query @ context.transpose(1, 2)).softmax(dim=-1))
+    summed = (weights @ context).transpose(0, 1)
+    value = model.decoder_value.weight.unflatten(0, (model.heads, -1)).transpose(1, 2)
+    bias = model.decoder_value.bias.view(model.heads, 1, -1)
+    mixed = torch.baddbmm(bias, summed, value).transpose(0, 1).flatten(1)
+    x = model.decoder_norm(z_query + _drop(model, model.decoder_out(mixed)))
+    x = model.decoder_end(_feed_forward(model.decoder_ff, x))
+    return x if model.output is None else model.output(x, step=tokens.shape[1] - 1)
+
+
+def _feed_forward(layer, x):
+    inner = _drop(layer, F.gelu(layer.expand(x)))
+    return layer.norm(x + _drop(layer, layer.contract(inner)))
+
+
+def _drop(layer, x):
+    return dropout(x, layer.dropout if layer.training else 0.0)
+
+
+def _split(model, packed):
+    shape = (*packed.shape[:2], 3, model.heads, packed.shape[-1] // 3 // model.heads)
+    return list(packed.reshape(shape).permute(2, 0, 3, 1, 4).unbind(0))
 
 
 def next_object_loop(decoder, z, previous, key_bias):
