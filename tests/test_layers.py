@@ -71,7 +71,7 @@ OWNERS = {
     "sklearn": ["sceneprior/evaluation/", "sceneprior/lifted/sampler/stage"],
     "scipy.optimize": [
         "sceneprior/core/overlaps.py", "sceneprior/paper/losses/matching.py",
-        "sceneprior/evaluation/", "data_prep/inspection/causes.py",
+        "sceneprior/evaluation/", "data_prep/inspection/truth_causes.py",
     ],
     "cv2": ["data_prep/posed/lens.py", "sceneprior/evaluation/metrics/"],
     "viser": ["sceneprior/apps/viewer/"],

@@ -176,7 +176,7 @@ def test_nothing_of_the_label_set(room):
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"floor_m": 1.55}, r"lowest camera is at 1\.50 m, below the floor at 1\.55 m: are the last"),
+        ({"floor_m": 1.55}, r"lowest camera is at 1\.50 m, below the floor at 1\.55 m: are the"),
         ({"metres_per_unit": 100}, r"cameras are spread over 480 m; is metres_per_unit wrong\?"),
         ({"w": 100}, r"masks are 128 x 96 pixels but the colour frames 100 x 96: with different"),
     ],
