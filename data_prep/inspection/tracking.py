@@ -1,4 +1,4 @@
-"""Whether the ids of masks are those of objects: tried by finding the objects without them."""
+"""Tests ids of masks against the objects that are found without them."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""What the readers of masks have in common, whatever tool wrote the masks."""
+"""Interface of the readers of masks, one for each tool that writes masks."""
 
 from abc import ABC, abstractmethod
 from collections import Counter

@@ -19,7 +19,7 @@ from sceneprior.core.instances.pngs import mask_size, read_mask
 from sceneprior.core.instances.tables import LARGEST_ID, read_class_table
 
 PLACES = ("masks", ".")
-"""Where the objects' folders may lie in a room's folder."""
+"""Places of the objects' folders in a room's folder."""
 
 
 class ObjectFolders(MaskFormat):

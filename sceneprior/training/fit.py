@@ -23,7 +23,7 @@ from sceneprior.training.callbacks import RollingCheckpoint, RunProgress, StepSe
 from sceneprior.training.checkpoints import check_resumable, read_checkpoint, write_checkpoint
 from sceneprior.training.method import RunConfig, Stage
 from sceneprior.training.settings import without_samples
-from sceneprior.training.slurm import first_process, slurm_plugins
+from sceneprior.training.slurm import first_process, requeue_on_signal, slurm_plugins
 
 LOGGERS = ("csv", "tensorboard", "wandb")
 """Names of the loggers that `fit` accepts."""
@@ -48,7 +48,7 @@ def fit(
         if name not in LOGGERS:
             raise InputError(f"No logger '{name}'; choose from {', '.join(LOGGERS)}.")
     previous = None
-    with _own_folder(run):
+    with _own_folder(run), requeue_on_signal():
         if first_process():
             _check_run(config, run, resume)
         for stage in config.stages():

@@ -1,5 +1,6 @@
 """Configs: every shipped one loads, and every mistake is a sentence that names its place."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -255,17 +256,29 @@ def test_a_file_that_is_no_config_is_a_sentence(tmp_path, text):
     assert "is not a YAML file" in refusal(path)
 
 
+def _laughs(levels: int) -> str:
+    """Ten times ten times ... a word, by aliases."""
+    lines = ["a: &a [ha, ha, ha, ha, ha, ha, ha, ha, ha, ha]"]
+    names = "abcdefghijklm"[:levels]
+    for before, name in pairwise(names):
+        lines.append(f"{name}: &{name} [{', '.join([f'*{before}'] * 10)}]")
+    return "\n".join(lines) + "\n"
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("x: " + "[" * 3000 + "]" * 3000, "maximum recursion depth exceeded"),
+        (_laughs(9) + "label_set: *i", "it has more than 20,000 values"),
+        ("x: " + "[" * 3000 + "]" * 3000, "it has more than 30 sections within each other"),
+        ("x: " + "{a: " * 3000 + "1" + "}" * 3000, "it has more than 30 sections within"),
+        ("x: &x [*x]", "it has an alias that stands for a part of itself"),
         ("x: 2001-99-99", "month must be in 1..12"),
         ("seed: " + "9" * 5000, "Exceeds the limit (4300 digits)"),
         ("#" * 2**20 + "\nx: 1", "it has more than 1,048,576 bytes"),
     ],
-    ids=["lists", "date", "digits", "bytes"],
+    ids=["laughs", "lists", "sections", "self", "date", "digits", "bytes"],
 )
-def test_yaml_that_python_cannot_read_is_refused(config, text, said):
+def test_yaml_that_would_fill_the_memory_or_the_stack_is_refused(config, text, said):
     config.write_text(text)
     assert refusal(config).startswith(f"{config} is not a YAML file: {said}")
     if len(text) < 2000:

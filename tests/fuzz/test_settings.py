@@ -17,8 +17,8 @@ from sceneprior.apps.priors.packed import pack, write_packed
 pytestmark = pytest.mark.slow
 
 ODD_YAML = (
-    "*a", "[[[[", "{a: {b: {c: 1}}}", "!!set {1, 2}", "!!binary aGVsbG8=", ".nan", "-1",
-    "99999999999999999999999", "2001-99-99", "~", "'", '"\\x0', "? [1]",
+    "*a", "&a [*a]", "[[[[", "{a: {b: {c: 1}}}", "!!set {1, 2}", "!!binary aGVsbG8=", ".nan", "-1",
+    "99999999999999999999999", "2001-99-99", "~", "'", '"\\x0', "? [1]", "0x" + "f" * 5000,
     "[" * 3000, "x" * 5000, "1e400", "!!python/object:os.system 1", "<<: *a",
 )  # fmt: skip
 
