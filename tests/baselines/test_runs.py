@@ -5,10 +5,13 @@ import csv
 import pytest
 import torch
 from interrupting import CPU, interrupted
+from typer.testing import CliRunner
 
+from sceneprior.apps.cli.commands import app
 from sceneprior.apps.config import load_any_run
 from sceneprior.apps.experiments.evaluate import evaluate_run, report_run
 from sceneprior.apps.sample import sample_rooms
+from sceneprior.core.settings import dump_settings
 from sceneprior.evaluation.room_sets import without_void
 from sceneprior.evaluation.synthesis import EvalOptions
 from sceneprior.training.checkpoints import find_checkpoint, read_checkpoint
@@ -44,7 +47,7 @@ def test_a_run_leaves_its_checkpoints_and_curves(baseline_run, method):
     assert not load_any_run(run).prior.training
 
 
-@pytest.mark.parametrize("method", ("gan", "sync2gen", "im3d"))
+@pytest.mark.parametrize("method", LOGGED)
 def test_an_interrupted_and_resumed_run_reaches_the_same_weights(
     baseline_config, baseline_run, method, tmp_path
 ):
@@ -62,6 +65,21 @@ def test_an_interrupted_and_resumed_run_reaches_the_same_weights(
     for one, other in zip(wanted["optimizer_states"], reached["optimizer_states"], strict=True):
         for key, moments in one["state"].items():
             assert torch.equal(moments["exp_avg_sq"], other["state"][key]["exp_avg_sq"])
+
+
+@pytest.mark.parametrize("method", ("atiss2d", "gan"))
+def test_the_command_line_trains_generates_and_evaluates(baseline_config, method, tmp_path):
+    epochs = ("layout__epochs", "shape__epochs") if method == "atiss2d" else ("training__epochs",)
+    config, run = tmp_path / "tiny.yaml", tmp_path / "run"
+    dump_settings(baseline_config(method, **dict.fromkeys(epochs, 1)), config)
+    for words in (
+        ["fit", "--config", str(config), "--run", str(run), "--accelerator", "cpu"],
+        ["synthesize", "--run", str(run), "-n", "3", "--out", str(tmp_path / "rooms")],
+        ["eval-fid", "--run", str(run), "-n", "4"],
+    ):  # fmt: skip
+        result = CliRunner().invoke(app, words)
+        assert result.exit_code == 0, result.output
+    assert len(list((tmp_path / "rooms").rglob("*.glb"))) == 3
 
 
 @pytest.mark.parametrize("method", ("atiss2d", *WITHOUT_LATENTS))

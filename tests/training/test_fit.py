@@ -66,11 +66,18 @@ def test_resuming_a_finished_run_trains_nothing(toy_run, toy_shards, tmp_path, m
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
 
 
-def test_an_interrupted_and_resumed_run_reaches_the_same_weights(toy_shards, tmp_path):
+@pytest.mark.parametrize(
+    "extra",
+    [
+        {},
+        {"model__decoder__dropout": 0.2},
+        {"layout__schedule": {"name": "cosine"}, "shape__schedule": {"name": "cosine"}},
+    ],
+    ids=["plain", "dropout", "cosine"],
+)
+def test_an_interrupted_and_resumed_run_reaches_the_same_weights(toy_shards, tmp_path, extra):
     """Stopped in the layout stage, gone on with, stopped in the shape stage, and finished."""
-    config = tiny_config(
-        toy_shards, model__decoder__dropout=0.2, layout__schedule={"name": "cosine"}
-    )
+    config = tiny_config(toy_shards, **extra)
     whole, run = tmp_path / "whole", tmp_path / "stopped"
     fit(config, whole, trainer_options=CPU)
     for stage, epoch, resume in (("layout", 4, False), ("shape", 2, True)):

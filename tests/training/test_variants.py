@@ -1,5 +1,6 @@
 """Ablations and released-code variants: each trains, resumes, is decoded and is sampled."""
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -38,6 +39,11 @@ VARIANTS = {
     },
     "c2_lstm": {"model__decoder": {"name": "lstm"}},
     "c3_one_stage": {"layout": None, "shape__epochs": 5},
+    "beveled_box": {
+        "layout__proxy": "beveled_box",
+        "shape__box_from": "proxy",
+        "shape__proxy": "beveled_box",
+    },
     "released": RELEASED,
     "lifted": {},
     "lifted_spread": {
@@ -71,6 +77,14 @@ def test_a_variant_learns(variant):
     assert all(torch.isfinite(torch.tensor(value)) for _, value in curves[term])
 
 
+def test_bevels_are_learnt_by_the_beveled_box_alone(variant):
+    _, config, run = variant
+    layout = getattr(config, "layout", None)
+    learnt = layout is not None and layout.proxy == "beveled_box"
+    moved = (load_run(run).prior.bevels.logits != -2).any(dim=1)
+    assert moved.any() if learnt else not moved.any()
+
+
 def test_a_variant_is_decoded_sampled_and_interpolated(variant):
     _, config, run = variant
     trained = load_run(run)
@@ -97,12 +111,12 @@ def test_a_variant_is_decoded_sampled_and_interpolated(variant):
             assert len(room.objects) == int((label[:n] != 0).sum())
 
 
-def test_a_stopped_lifted_run_resumes_to_the_same_weights(toy_shards, tmp_path, monkeypatch):
-    config = tiny_lifted(toy_shards, **VARIANTS["lifted_spread"])
-    whole, run = tmp_path / "whole", tmp_path / "run"
-    fit(config, whole, trainer_options=CPU)
+def test_a_stopped_variant_resumes_to_the_same_weights(variant, tmp_path, monkeypatch):
+    _, config, whole = variant
     found = lifted.choose_prototypes
-    interrupted(config, run, "shape", 1)
+    run = shutil.copytree(whole, tmp_path / "run")
+    shutil.rmtree(run / "shape")
+    interrupted(config, run, "shape", 1, resume=True)
     assert not (run / "shape" / "final.ckpt").exists()
     # Another processor finds prototypes in another order; the checkpoint's are taken.
     monkeypatch.setattr(

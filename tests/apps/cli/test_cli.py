@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -136,3 +137,35 @@ def test_a_folder_is_no_file_for_results(command, toy_run, tmp_path):
         name, *rest = words
         said = one_sentence(command(name, "--run", toy_run, *rest, "--out", tmp_path))
         assert f"{tmp_path} is a folder; name a file with --out." in said
+
+
+def test_commands_on_a_disk_that_is_full(command, toy_run, toy_shards, tmp_path):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=100k", "tmpfs", str(disk)], capture_output=True
+    )
+    if mounted.returncode:
+        pytest.skip("only root mounts a small disk")
+    try:
+        config = write_tiny_config(tmp_path / "tiny.yaml", toy_shards)
+        cpu = ("--accelerator", "cpu")
+        assert "homes cannot be" in on_full(command, "make-homes", disk / "homes", "--rooms", 2)
+        said = on_full(command, "fit", "--config", config, "--run", disk / "run", *cpu)
+        assert f"{disk / 'run'}" in said
+        shutil.rmtree(disk / "run")
+        (disk / "fill").write_bytes(bytes(96_000))
+        said = on_full(command, "synthesize", "--run", toy_run, "--out", disk / "rooms")
+        assert f"{disk / 'rooms'} cannot be" in said
+        said = on_full(command, "fit", "--config", config, "--run", disk / "full", *cpu)
+        assert f"{disk / 'full'}" in said
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
+
+
+def on_full(command, *words) -> str:
+    status, _, errors = command(*words)
+    last = errors.strip().splitlines()[-1]  # progress bars may stand before it
+    assert status == 2 and "Traceback" not in errors, errors
+    assert last.endswith("(No space left on device); make room on its disk, or name another place.")
+    return last

@@ -1,6 +1,8 @@
 """interpolate, retrieve and complete as commands: files, and sentences for what does not work."""
 
+import errno
 import json
+import os
 
 import pytest
 import torch
@@ -8,6 +10,7 @@ from cli_helpers import everything_in, one_sentence
 from model_folder import corner_sofa, write_models
 
 from sceneprior.apps.config import load_run
+from sceneprior.core import files
 from sceneprior.paper import decode
 
 
@@ -130,3 +133,24 @@ def test_complete_adds_what_is_asked_for(command, sampler_run, tmp_path):
     assert "Note: complete_00 has no place for double_bed." in errors
     room = json.loads((tmp_path / "full" / "complete_00.json").read_text())
     assert len(room["objects"]) == 1 and room["extra"]["no_place"] == ["double_bed"]
+
+
+def test_a_place_that_cannot_be_written_is_a_sentence(
+    command, toy_run, toy_shards, rooms, tmp_path, monkeypatch
+):
+    write_models(tmp_path / "models", {"bed": ("King-size Bed", corner_sofa())})
+
+    def refuse(*_):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(files.os, "fsync", refuse)
+    for words in (
+        ("export", "rooms", "--to", "obj"),
+        ("complete", "--run", toy_run, "--given", rooms / "seed0_0000.json"),
+        ("interpolate", "--run", toy_run, "--from", "seed:1", "--to", "seed:2"),
+        ("retrieve", "--scenes", "rooms", "--models", "models", "--cache", "cache"),
+        ("reconstruct", "--run", toy_run, "--shards", toy_shards, "--split", "test"),
+    ):
+        said = one_sentence(command(*words, "--out", "new"))
+        assert "new cannot be read or written (Read-only file system); name a place that" in said
+        assert not (tmp_path / "new").exists()

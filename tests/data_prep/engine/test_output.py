@@ -2,9 +2,13 @@
 
 import errno
 import os
+import resource
 import stat
+import subprocess
+import sys
 
 import pytest
+from front_files import bedroom
 from front_jobs import digests, front_job, three_houses
 from toy_source import ToySource
 
@@ -32,7 +36,7 @@ def test_a_folder_that_cannot_be_written(front, tmp_path):
     ],
     ids=["full", "read-only"],
 )  # fmt: skip
-@pytest.mark.parametrize("after", [0, 1, 7, 11, 13])
+@pytest.mark.parametrize("after", [0, 1, 4, 7, 9, 11, 13])
 def test_a_disk_that_fills_up(tmp_path, monkeypatch, number, said, after):
     """From the `after`-th file on nothing can be written; then there is room again."""
     out, whole = tmp_path / "shards", tmp_path / "whole"
@@ -51,12 +55,36 @@ def test_a_disk_that_fills_up(tmp_path, monkeypatch, number, said, after):
         patch.setattr(files.os, "fsync", full)
         with pytest.raises(InputError, match=said) as told:
             build_shards(Job(source, out))
-    if after in (1, 7):
+    if after in (1, 4, 7):
         assert "(rooms box_0 to box_8)" in str(told.value)  # the first shard's
     found = digests(out) if out.exists() else {}
     assert len(found) == after and found.items() <= expected.items()
     build_shards(Job(source, out))
     assert digests(out) == expected
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_the_kernel_refuses_large_files(front, tmp_path, workers):
+    """A real limit in a real process: no file may grow beyond 20 kB, and shards do."""
+    three_houses(front)
+    front.house("more", *(bedroom(f"Bedroom-{k}") for k in range(2)))
+    out = tmp_path / "shards"
+    command = [
+        sys.executable, "-m", "sceneprior", "prep-front", "--front", front.front, "--out", out,
+        "--future", front.future, "--workers", str(workers), "--renderer", "software",
+        "--views-per-m2", "0.5",
+    ]  # fmt: skip
+    limit = (20_000, 20_000)
+    done = subprocess.run(
+        command, capture_output=True, text=True, env=os.environ | {"NUMBA_CACHE_DIR": ""},
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, limit),
+    )  # fmt: skip
+    assert done.returncode == 2, done.stderr
+    assert "(rooms " in done.stderr and "cannot be written (File too large)" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not list(out.rglob("*.part")) and not list(out.rglob("*.h5"))
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_what_a_worker_left_that_died_on_the_way_is_cleared_away_at_the_end(tmp_path):

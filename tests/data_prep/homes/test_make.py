@@ -11,6 +11,7 @@ from homes_on_disk import TYPES
 from data_prep.homes.make import make_homes
 from sceneprior.core.classes import LABEL_SETS
 from sceneprior.core.errors import InputError
+from sceneprior.core.files import only_writer
 from sceneprior.furniture.catalog import make_catalog
 
 
@@ -71,6 +72,12 @@ def test_bad_input_is_one_sentence_and_leaves_nothing(tmp_path):
     with pytest.raises(NotADirectoryError, match="new"):
         make_homes(full / "notes.txt" / "new", 4, "bedroom", 0)
     assert [path.name for path in tmp_path.iterdir()] == ["full"]
+
+
+def test_a_second_writer_of_one_folder_is_refused(tmp_path):
+    with only_writer(tmp_path / "new"), pytest.raises(InputError, match="Another run is writing"):
+        make_homes(tmp_path / "new", 2, "bedroom", 0)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_full_disk_is_an_error_that_names_the_folder_and_leaves_nothing(tmp_path, monkeypatch):
