@@ -135,7 +135,7 @@ def _metres_per_unit(evidence: Evidence) -> float | None:
 
 
 def what_was_checked(evidence: Evidence) -> tuple[list[str], list[str]]:
-    """Parts of sentences: the errors of cameras that the masks exclude, and those that they do not."""
+    """Parts of sentences: errors of cameras that the masks exclude, and those they do not."""
     fit, least = evidence.share(GIVEN), margin(evidence)
 
     def excluded(causes: list[Cause]) -> bool:

@@ -8,24 +8,30 @@ from abc import abstractmethod
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, Field
+from pydantic import BaseModel
 
 from data_prep.posed.mask_format import MaskFormat, instead, main_classes
 from data_prep.posed.recording import PosedFrame
 from sceneprior.core.errors import InputError
 from sceneprior.core.instances.checked import checked, shown
-from sceneprior.core.instances.coco import CROWD, check_size, decode, paint, read_coco_json
+from sceneprior.core.instances.coco import (
+    CROWD,
+    Category,
+    CocoId,
+    Side,
+    check_size,
+    decode,
+    paint,
+    read_coco_json,
+)
 from sceneprior.core.instances.tables import LARGEST_ID
 
 FILES = ("*coco*.json", "instances*.json", "annotations*.json", "annotations/*.json")
 """Names, as patterns, under which COCO's JSON is looked for in a room's folder."""
 _TRACKS = ("track_id", "instance_id")
-
-_Side = Annotated[int, Field(ge=1)]
-_Id = int | str
 
 
 @dataclass
@@ -85,55 +91,50 @@ class SegmentedFrames(MaskFormat):
 
 
 class _Image(BaseModel):
-    id: _Id
+    id: CocoId
     file_name: str
-    height: _Side
-    width: _Side
+    height: Side
+    width: Side
 
 
 class _Video(BaseModel):
-    id: _Id
+    id: CocoId
     file_names: list[str]
-    height: _Side
-    width: _Side
-
-
-class _Category(BaseModel):
-    id: _Id
-    name: str
+    height: Side
+    width: Side
 
 
 class _Annotation(BaseModel):
     id: Any = None
-    category_id: _Id
+    category_id: CocoId
     iscrowd: bool = False
 
 
 class _ImageAnnotation(_Annotation):
-    image_id: _Id
+    image_id: CocoId
     segmentation: Any = None
-    track_id: _Id | None = None
-    instance_id: _Id | None = None
+    track_id: CocoId | None = None
+    instance_id: CocoId | None = None
     attributes: Any = None
 
     @property
-    def track(self) -> _Id | None:
+    def track(self) -> CocoId | None:
         """The track, which CVAT puts among the attributes."""
         attributes = self.attributes if isinstance(self.attributes, dict) else {}
         for key in _TRACKS:
             for value in (getattr(self, key), attributes.get(key)):
-                if isinstance(value, _Id):
+                if isinstance(value, CocoId):
                     return value
         return None
 
 
 class _VideoAnnotation(_Annotation):
-    video_id: _Id
+    video_id: CocoId
     segmentations: list[Any]
 
 
 class _Coco(BaseModel):
-    categories: list[_Category]
+    categories: list[Category]
 
 
 class _Images(_Coco):
@@ -203,7 +204,7 @@ class CocoMasks(SegmentedFrames):
     def _of_images(
         self, coco: _Images, class_of: list[str], path: Path
     ) -> dict[str, SegmentedFrame]:
-        of_id: dict[_Id, SegmentedFrame] = {}
+        of_id: dict[CocoId, SegmentedFrame] = {}
         frames: dict[str, SegmentedFrame] = {}
         for image in coco.images:
             frame = SegmentedFrame((image.height, image.width), str(path))

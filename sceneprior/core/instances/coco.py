@@ -20,23 +20,27 @@ Photographs have at most about half as many."""
 _PIXELS_AT_ONCE = 1 << 20
 _LONGEST_RUN_BITS = 40
 
-_Side = Annotated[int, Field(ge=1)]
-_Id = int | str
+Side = Annotated[int, Field(ge=1)]
+"""Height or width of an image in pixels."""
+CocoId = int | str
+"""Id of an image, annotation, category or track; COCO has numbers, other tools also text."""
 
 
 class _Image(BaseModel):
-    height: _Side
-    width: _Side
+    height: Side
+    width: Side
 
 
-class _Category(BaseModel):
-    id: _Id
+class Category(BaseModel):
+    """A class of a COCO JSON."""
+
+    id: CocoId
     name: str
 
 
 class _Annotation(BaseModel):
     id: Any = None
-    category_id: _Id
+    category_id: CocoId
     segmentation: Any
     iscrowd: bool = False
 
@@ -44,7 +48,7 @@ class _Annotation(BaseModel):
 class _Coco(BaseModel):
     images: list[_Image]
     annotations: list[_Annotation]
-    categories: list[_Category]
+    categories: list[Category]
 
 
 def read_coco(path: Path) -> tuple[np.ndarray, dict[int, str]]:
