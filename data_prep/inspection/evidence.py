@@ -14,6 +14,8 @@ _LEAST_VIEWS = 5
 """Views from which on the order of frames can be compared."""
 
 _SAME_FLOOR_M = 0.1
+_PIECES = 3
+"""Minimum number of pieces that tell the floor of a room: two lamps may hang at one height."""
 
 
 class Evidence(NamedTuple):
@@ -30,6 +32,8 @@ class Evidence(NamedTuple):
     masks: int
     once: int
     """Ids that are in one view only."""
+    measured: int
+    """Objects whose lengths are known."""
     nearness: float | None
     """Rank correlation, over pairs of views, of the pixels on the same objects and the angle
     between the cameras, negated: about 0 if poses belong to other frames. None for few views."""
@@ -40,7 +44,7 @@ class Evidence(NamedTuple):
     length_m: float | None
     """Median length of the objects; None without any."""
     floor_m: float | None
-    """Height at which the lowest objects end (`find_floor`)."""
+    """Height at which the lowest objects end (`find_floor`); None if few of them agree."""
 
     def share(self, cause: Cause) -> float:
         """Mean agreement in [0, 1] after a correction."""
@@ -63,9 +67,9 @@ def room_evidence(views: RoomViews, convention: Convention, floor: bool = True) 
     x, y, z = (-turns[:, 1]).mean(axis=0).tolist()
     return Evidence(
         sums, 1, len(found.item), found.spare, len(views.visible), int((shown > 0).sum()),
-        int(shown.sum()), int((shown == 1).sum()), _nearness(views), (x, y, z),
-        float(np.median(eyes[:, 1])), _length(found, depth[0], lenses),
-        None if level is None else level[0],
+        int(shown.sum()), int((shown == 1).sum()), len(np.unique(found.item)),
+        _nearness(views), (x, y, z), float(np.median(eyes[:, 1])), _length(found, depth[0], lenses),
+        None if level is None or level[1] < _PIECES else level[0],
     )  # fmt: skip
 
 
@@ -73,7 +77,7 @@ def total(rooms: list[Evidence]) -> Evidence:
     """Evidence of several rooms together: sums of counts, medians or means of the others."""
     causes = {cause: None for room in rooms for cause in room.sums}
     sums = {cause: sum(room.sums.get(cause, 0.0) for room in rooms) for cause in causes}
-    names = ("rooms", "middles", "spare", "views", "ids", "masks", "once")
+    names = ("rooms", "middles", "spare", "views", "ids", "masks", "once", "measured")
     counts = {name: sum(getattr(room, name) for room in rooms) for name in names}
     x, y, z = np.mean([room.tops for room in rooms], axis=0).tolist()
     nearness, length, floor = (

@@ -25,6 +25,8 @@ _NEARNESS = 0.1
 """Mean correlation below which poses belong to other frames; right rooms have 0.1 to 0.7."""
 _EYES_M, _LENGTHS_M = (0.2, 4.0), (0.15, 6.0)
 """Plausible ranges of the median camera height and of the median length of objects."""
+_SOME_LENGTHS = 3
+"""Minimum number of objects whose lengths are judged: a single one may be badly seen."""
 _FLOOR_M = 0.15
 _ONCE, _SOME_IDS = 0.8, 8
 """Share of ids in a single view above which ids are not tracked, if there are so many."""
@@ -102,9 +104,10 @@ def _implausible(evidence: Evidence, given: Given) -> Finding | None:
     axis = int(np.abs(evidence.tops).argmax())
     if abs(evidence.tops[axis]) > 0.5 and evidence.tops[1] <= 0.5:
         return Finding("up", of_up(axis, float(np.sign(evidence.tops[axis])), given))
+    length_m = evidence.length_m if evidence.measured >= _SOME_LENGTHS else None
     for what, value, bounds in (
         ("the cameras stand", evidence.eye_m, _EYES_M),
-        ("the objects are", evidence.length_m, _LENGTHS_M),
+        ("the objects are", length_m, _LENGTHS_M),
     ):
         if value is not None and not bounds[0] <= value <= bounds[1]:
             factor = _metres_per_unit(evidence) if given.posed else None

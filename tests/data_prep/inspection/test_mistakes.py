@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 from captures import FLIP, Z_UP, changed, make_captures, of_ids, of_keys, of_poses, shards_of
 
+from data_prep.inspection.given import given_of
 from data_prep.inspection.tables import summary
+from data_prep.inspection.verdicts import find_mistake
 from data_prep.inspection.verify import verify
 from sceneprior.core.errors import InputError
 
@@ -192,6 +194,22 @@ def test_the_first_cause_named_is_the_mistake(captures, name, tmp_path):
     mistake = MISTAKES[name]
     wrong = changed(captures, tmp_path / "wrong", mistake.change)
     assert re.search(mistake.said, first_said(wrong, tmp_path / "shards"))
+
+
+@pytest.mark.parametrize(("rooms", "seed", "views_per_m2"), [(2, 120, 0.5), (3, 196, 0.8)])
+def test_few_pieces_tell_neither_floor_nor_unit(tmp_path, rooms, seed, views_per_m2):
+    """Two lamps that hang at one height, and a room with a single piece, badly seen."""
+    make_captures(tmp_path / "captures", rooms, seed, views_per_m2)
+    assert verify(shards_of(tmp_path / "captures", tmp_path / "shards")).problems == ()
+
+
+def test_a_floor_at_the_wrong_height_is_named(captures, tmp_path):
+    shards = shards_of(captures, tmp_path / "shards")
+    evidence, given = verify(shards).evidence, given_of(shards, "posed")[0]
+    found = find_mistake(evidence._replace(floor_m=0.4), given, lambda: pytest.fail("no doubt"))
+    assert found.sentence.startswith(
+        "the lowest objects end 0.40 m above the floor: correct or leave out floor_m"
+    )
 
 
 def test_right_captures_pass_and_what_was_checked_is_said(captures, tmp_path):
