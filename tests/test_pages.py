@@ -57,6 +57,7 @@ ELSEWHERE = {
     "compare/new_rooms_small.yaml": "tests/apps/experiments/test_compare.py compares toys",
     "compare/single_view.yaml": "tests/apps/experiments/test_compare_views.py compares toys",
     "--devices 2": "tests/training/test_processes.py trains in two processes",
+    "--devices 4 --resume": "tests/training/test_slurm.py is stopped and queued again as there",
     "python benchmarks/": "a measurement, of runs that take hours",
 }
 """Part of a command -> the reason why such commands are not run here."""
