@@ -46,7 +46,7 @@ OWNERS = {
     "OpenGL": ["sceneprior/render/offscreen/"],
     "numba": [
         "sceneprior/render/silhouettes/", "sceneprior/render/offscreen/zbuffer.py",
-        "sceneprior/lifted/lifting/", "data_prep/tracks/",
+        "sceneprior/render/offscreen/sky.py", "sceneprior/lifted/lifting/", "data_prep/tracks/",
     ],
     "triton": ["sceneprior/render/silhouettes/"],
     "lightning": [

@@ -2,12 +2,14 @@
 
 import numpy as np
 from jaxtyping import Float, Int
+from numba import njit
 
 from sceneprior.render.offscreen.cameras import Pinhole
 
-DIRECTIONS = 24
-"""Number of directions towards the sky in which light is tested for occlusion."""
-MAP_PX = 320
+DIRECTIONS = 128
+"""Number of directions towards the sky in which light is tested for occlusion. With 24, the floor
+shows the outline of each single shadow."""
+MAP_PX = 192
 """Side in pixels of the depth map that is drawn for each direction."""
 BIAS_M = 0.02
 """Minimum distance of an occluder from the surface that it shades, so that no surface shades
@@ -42,7 +44,7 @@ def sky_light(
     middle_m = (vertices_m[shown].min(axis=0) + vertices_m[shown].max(axis=0)) / 2
     reach_m = np.linalg.norm(np.ptp(vertices_m[shown], axis=0)) / 2 + 0.1
     scale = float(MAP_PX / (2 * reach_m))
-    open_sky = np.zeros(len(points_m))
+    open_sky = np.zeros(len(points_m), dtype=np.int64)
     for towards in _directions():
         side = np.cross([0.0, 0.0, 1.0], towards)
         side /= np.linalg.norm(side)
@@ -51,12 +53,26 @@ def sky_light(
         pose[:3, :3], pose[:3, 3] = rotation, [0, 0, 2 * reach_m] - rotation @ middle_m
         projection = (scale, scale, MAP_PX / 2, MAP_PX / 2)
         _, nearest = rasterize(vertices_m, faces, pose, projection, (MAP_PX, MAP_PX), False)
-        seen = points_m @ rotation.T + pose[:3, 3]
-        u, v = np.clip(seen[:, :2] * scale + MAP_PX / 2, 0, MAP_PX - 1).astype(int).T
-        # Within one pixel of the map, the depth of a slope of 45 degrees varies by 1 / scale.
-        open_sky += seen[:, 2] <= nearest[v, u] + BIAS_M + 1 / scale
+        # Within one pixel of the map, the depth of the floor varies by its slope over the scale; at
+        # least that of a slope of 45 degrees is allowed for, since furniture has other sides.
+        slope = max(1.0, np.hypot(towards[0], towards[2]) / towards[1])
+        _count_unoccluded(points_m, pose, scale, nearest, BIAS_M + slope / scale, open_sky)
     light[rows, columns] = DARKEST + (1 - DARKEST) * open_sky / DIRECTIONS
     return light
+
+
+@njit(cache=True, nogil=True)
+def _count_unoccluded(points_m, pose, scale, nearest_m, bias_m, count):
+    """Add 1 to the count of each point with nothing nearer than itself in an orthographic depth
+    map."""
+    m, side = pose, len(nearest_m)
+    for i in range(len(points_m)):
+        x, y, z = points_m[i, 0], points_m[i, 1], points_m[i, 2]
+        u = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) * scale + side / 2
+        v = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) * scale + side / 2
+        depth_m = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+        column, row = min(max(int(u), 0), side - 1), min(max(int(v), 0), side - 1)
+        count[i] += depth_m <= nearest_m[row, column] + bias_m
 
 
 def _directions() -> Float[np.ndarray, "directions 3"]:
