@@ -1,7 +1,7 @@
 """Convex bodies of objects, for physics: their solids, or convex parts of their meshes."""
 
 from functools import cache
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -31,10 +31,19 @@ _FILL = {
 }  # fmt: skip
 
 
+def support_of(item: SceneObject) -> Literal["ground", "wall", "ceiling"]:
+    """What an object is expected to rest on, by its class: lamps of the classes `HUNG` on the
+    ceiling, pieces of the classes `MOUNTED` on a wall if their lower face is above 0.4 m, and all
+    others on the ground or on an object."""
+    if item.label in HUNG:
+        return "ceiling"
+    bottom_m = item.center_m[1] - item.size_m[1] / 2
+    return "wall" if item.label in MOUNTED and bottom_m > MOUNTED_M else "ground"
+
+
 def is_fixed(item: SceneObject) -> bool:
     """True for objects that hang, which simulators hold in place."""
-    bottom_m = item.center_m[1] - item.size_m[1] / 2
-    return item.label in HUNG or (item.label in MOUNTED and bottom_m > MOUNTED_M)
+    return support_of(item) != "ground"
 
 
 def colliders(item: SceneObject) -> tuple[Solid | Mesh, ...]:
