@@ -57,7 +57,8 @@ class Agreement:
 
     def __add__(self, other: "Agreement") -> "Agreement":
         kinds = [kind for kind in KINDS if kind in self.tallies or kind in other.tallies]
-        return Agreement({kind: _sum(self.of(kind), other.of(kind)) for kind in kinds})
+        pairs = {kind: zip(self.of(kind), other.of(kind), strict=True) for kind in kinds}
+        return Agreement({kind: Tally._make(map(sum, pair)) for kind, pair in pairs.items()})
 
     def of(self, kind: str) -> Tally:
         """Tally of one kind; empty if it does not occur."""
@@ -76,10 +77,6 @@ class Agreement:
         if tally.masks >= least and tally.share < share * HELD_AT_LEAST[kind]:
             return False
         return tally.whole < least or tally.mean_iou >= share * IOU_AT_LEAST[kind]
-
-
-def _sum(a: Tally, b: Tally) -> Tally:
-    return Tally(a.masks + b.masks, a.held + b.held, a.whole + b.whole, a.iou + b.iou)
 
 
 class Comparison(NamedTuple):

@@ -11,10 +11,9 @@ from data_prep.engine.source import SPLITS
 from data_prep.inspection.agreement import Agreement
 from data_prep.inspection.bodies import KINDS
 from data_prep.inspection.causes import CHANCE, GIVEN
-from data_prep.inspection.evidence import total
 from data_prep.inspection.pictures import choose_views
 from data_prep.inspection.verdicts import what_was_checked
-from data_prep.inspection.verify import FolderCheck, RoomCheck
+from data_prep.inspection.verify import FolderCheck, RoomCheck, evidence_of
 from data_prep.inspection.words import counts
 from sceneprior.core.classes import label_set
 from sceneprior.core.shards import Shard, iterate_rooms, read_index
@@ -101,8 +100,7 @@ def _least(check: RoomCheck) -> float:
 
 def _fit(checks: Sequence[RoomCheck]) -> float | None:
     """Fit of masks and cameras; None if nothing determines it."""
-    known = [check.evidence for check in checks if check.evidence is not None]
-    evidence = total(known) if known else None
+    evidence = evidence_of(checks)
     return evidence.share(GIVEN) if evidence is not None and evidence.spare else None
 
 

@@ -42,7 +42,6 @@ class RoomCheck:
     """Agreement of ground truth and masks."""
     outliers: tuple[str, ...] = ()
     """Views and objects that disagree with the ground truth, as sentences."""
-    has_truth: bool = False
     has_checksum: bool = False
 
 
@@ -68,8 +67,13 @@ class FolderCheck:
     @property
     def evidence(self) -> Evidence | None:
         """Evidence of all rooms together; None if there is none."""
-        found = [room.evidence for room in self.every if room.evidence is not None]
-        return total(found) if found else None
+        return evidence_of(self.every)
+
+
+def evidence_of(checks: Sequence[RoomCheck]) -> Evidence | None:
+    """Evidence of rooms together; None if there is none."""
+    known = [check.evidence for check in checks if check.evidence is not None]
+    return total(known) if known else None
 
 
 def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> FolderCheck:
@@ -120,13 +124,12 @@ def _verdict(
     masks show no mistake, sentences about the ground truth."""
 
     def mistake(checks: Sequence[RoomCheck]) -> Finding | None:
-        known = [check.evidence for check in checks if check.evidence is not None]
-        if not known:
+        if (evidence := evidence_of(checks)) is None:
             return None
         origins = [given.get(check.room_id, usual) for check in checks]
         names = [origin.file for origin in origins]
         origin = origins[names.index(max(names, key=names.count))]
-        return find_mistake(total(known), origin, lambda: _tracks_of(folder, checks))
+        return find_mistake(evidence, origin, lambda: _tracks_of(folder, checks))
 
     if (finding := mistake(rooms)) is not None:
         return [f"{folder}: {finding.sentence}."]
@@ -249,7 +252,7 @@ def _check_room(shard: Shard, folder: Path, name: str, room_id: str, given: Give
         problems += found
     check = RoomCheck(
         name, room_id, len(views.visible), len(views.object_class),
-        problems=tuple(problems), has_truth=truth is not None, has_checksum=stored is not None,
+        problems=tuple(problems), has_checksum=stored is not None,
     )  # fmt: skip
     if wrong:
         return check

@@ -27,7 +27,7 @@ from data_prep.engine.source import RoomTask
 from data_prep.frames import GL_TO_CV
 from data_prep.front.recipe import Recipe
 from data_prep.public.hdf5 import read_hdf5
-from data_prep.public.rooms import FoundRoom, FramedRoom, chosen_frames, sampled
+from data_prep.public.rooms import FoundRoom, FramedRoom, Reader, chosen_frames, sampled
 from sceneprior.core.errors import InputError
 from sceneprior.core.furniture import INFO_FILES, model_categories, tidy_category
 from sceneprior.core.instances.checked import plain, shown
@@ -57,11 +57,10 @@ _PARTS = TypeAdapter(list[_Part])
 
 
 @dataclass(frozen=True)
-class BlenderProc:
-    """The `Reader` (source.py) of BlenderProc's frames; a house is a scene with several rooms."""
+class BlenderProc(Reader):
+    """BlenderProc's frames; a house is a scene with several rooms."""
 
     name: ClassVar = "blenderproc"
-    folder: Path
     recipe: Recipe
     """Its classes and room types; the other rules would need the house files."""
 
@@ -85,10 +84,6 @@ class BlenderProc:
     def scenes(self) -> list[str]:
         """See `Reader.scenes`."""
         return sorted(path.name for path in self.folder.iterdir() if any(path.glob("*.hdf5")))
-
-    def official_split(self, scene: str) -> str | None:
-        """See `Reader.official_split`."""
-        return None
 
     def rooms(self, scene: str) -> dict[str, FoundRoom]:
         """Rooms of the recipe's types; a frame belongs to the room with most furniture pixels."""

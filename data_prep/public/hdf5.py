@@ -1,9 +1,7 @@
 """Reads arrays of other programs' HDF5 files, with one sentence for whatever is wrong with them."""
 
-import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,25 +16,18 @@ def read_hdf5(path: Path, names: Sequence[str], hint: str) -> list[np.ndarray]:
     """Read the arrays with these names; `hint` ends the message if one is missing or unusable."""
     import h5py  # here, because the other sources do not need it
 
-    with _opened(h5py, path, hint) as file:
-        missing = [name for name in names if not isinstance(file.get(name), h5py.Dataset)]
-        if missing:
-            there = ", ".join(plain(str(name)) for name in list(file)[:8]) or "nothing"
-            raise InputError(f"{path} has no '{missing[0]}' (it has {there}); {hint}.")
-        for name in names:
-            if file[name].size is None or file[name].size > _MOST_VALUES:
-                raise InputError(f"{path}: '{name}' has {file[name].size} values; {hint}.")
-        return [np.asarray(file[name][()]) for name in names]
-
-
-@contextlib.contextmanager
-def _opened(h5py: Any, path: Path, hint: str) -> Iterator[Any]:
-    """Open a file; any error in the block becomes an `InputError`."""
     if not path.is_file():
         raise InputError(f"{path} is missing; {hint}.")
     try:
         with h5py.File(path, "r") as file:
-            yield file
+            missing = [name for name in names if not isinstance(file.get(name), h5py.Dataset)]
+            if missing:
+                there = ", ".join(plain(str(name)) for name in list(file)[:8]) or "nothing"
+                raise InputError(f"{path} has no '{missing[0]}' (it has {there}); {hint}.")
+            for name in names:
+                if file[name].size is None or file[name].size > _MOST_VALUES:
+                    raise InputError(f"{path}: '{name}' has {file[name].size} values; {hint}.")
+            return [np.asarray(file[name][()]) for name in names]
     except InputError:
         raise
     except Exception as error:  # the type that h5py raises depends on the damage

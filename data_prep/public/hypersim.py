@@ -25,9 +25,8 @@ from data_prep.engine.source import RoomTask
 from data_prep.frames import GL_TO_CV, Y_UP
 from data_prep.public.hdf5 import read_hdf5
 from data_prep.public.nyu40 import ids_and_classes
-from data_prep.public.rooms import FoundRoom, FramedRoom, box_of, chosen_frames, sampled
+from data_prep.public.rooms import FoundRoom, FramedRoom, Reader, box_of, chosen_frames, sampled
 from data_prep.public.tilt import pinhole, straight_grid
-from data_prep.scannet.labels import LABEL_SET
 from sceneprior.core.errors import InputError
 from sceneprior.core.instances.checked import plain
 
@@ -37,13 +36,10 @@ _HINT = "download the scene again"
 
 
 @dataclass(frozen=True)
-class Hypersim:
-    """The `Reader` (source.py) of Hypersim's scenes."""
+class Hypersim(Reader):
+    """Hypersim's scenes."""
 
     name: ClassVar = "hypersim"
-    label_set: ClassVar = LABEL_SET
-    room_type: ClassVar = "hypersim"
-    folder: Path
 
     def settings(self) -> dict[str, Any]:
         """See `Reader.settings`."""
@@ -57,10 +53,6 @@ class Hypersim:
             for path in self.folder.iterdir()
             if re.fullmatch(r"ai_\d{3}_\d{3}", path.name) and (path / "_detail").is_dir()
         )
-
-    def official_split(self, scene: str) -> str | None:
-        """See `Reader.official_split`."""
-        return None
 
     def rooms(self, scene: str) -> dict[str, FoundRoom]:
         """The scene as one room."""

@@ -1,11 +1,13 @@
 """Turns frames of instance ids with cameras and 3D boxes into a prepared room."""
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 
-from data_prep.engine.source import PreparedRoom
+from data_prep.engine.source import PreparedRoom, RoomTask
 from data_prep.frames import (
     FrameChoice,
     choose_frames,
@@ -15,11 +17,13 @@ from data_prep.frames import (
     sampled_lines,
     shrunk,
 )
+from data_prep.scannet.labels import LABEL_SET
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.instances.observations import Observations, observe
 from sceneprior.core.instances.tables import IdTable, tidy
 from sceneprior.core.shards import RoomGroundTruth
+from sceneprior.core.shell import rectangle
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,46 @@ class FoundRoom:
     """(height, width) of its images of ids, before they are shrunk."""
     extra: dict[str, Any] = field(default_factory=dict)
     """JSON values that reading the room needs (`RoomTask.extra`)."""
+
+
+@dataclass(frozen=True)
+class Reader(ABC):
+    """Knows the files of one data set."""
+
+    name: ClassVar[str]
+    """Name of the data set in `index.json`."""
+    folder: Path
+    """The folder of scenes."""
+
+    @property
+    def label_set(self) -> str:
+        """Name of the label set."""
+        return LABEL_SET
+
+    @property
+    def room_type(self) -> str:
+        """Type of the rooms; also in the shards' names."""
+        return self.name
+
+    def settings(self) -> dict[str, Any]:
+        """Settings that the shards depend on; checks the files that all scenes share."""
+        return {}
+
+    @abstractmethod
+    def scenes(self) -> list[str]:
+        """Names of the scenes' folders, sorted; rooms of one scene are in one split."""
+
+    def official_split(self, scene: str) -> str | None:
+        """Split of a scene, if the data set states it in the scene's name."""
+        return None
+
+    @abstractmethod
+    def rooms(self, scene: str) -> dict[str, FoundRoom]:
+        """Rooms of a scene by id: the scene's name, or that with `_` and the room's."""
+
+    @abstractmethod
+    def read(self, task: RoomTask, max_side: int | None, max_views: int) -> FramedRoom:
+        """Read one room with at most so many views, its images shrunk to `max_side`."""
 
 
 def sampled(
@@ -107,9 +151,8 @@ def prepare_room(room_id: str, room: FramedRoom, label_set_name: str) -> Prepare
         )
     outline = room.floor_m
     if outline is None:
-        ends = boxes.reshape(-1, 3) if len(boxes) else eyes
-        (x, z), (far_x, far_z) = ends[:, [0, 2]].min(axis=0), ends[:, [0, 2]].max(axis=0)
-        outline = np.array([(x, z), (far_x, z), (far_x, far_z), (x, far_z)])
+        ends = (boxes.reshape(-1, 3) if len(boxes) else eyes)[:, ::2]
+        outline = rectangle(ends.min(axis=0), ends.max(axis=0))
     center = (outline.min(axis=0) + outline.max(axis=0)) / 2
     origin = np.array([center[0], floor_y, center[1]])
     room_from_world = np.eye(4)

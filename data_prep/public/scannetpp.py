@@ -27,7 +27,7 @@ from data_prep.posed.colmap import read_model
 from data_prep.posed.recording import Camera, PosedFrame, frame_intrinsics
 from data_prep.posed.transforms import FILE_NAME, read_recording
 from data_prep.public.nyu40 import LIKE_NYU40
-from data_prep.public.rooms import FoundRoom, FramedRoom, chosen_frames
+from data_prep.public.rooms import FoundRoom, FramedRoom, Reader, chosen_frames
 from data_prep.scannet.annotations import (
     Group,
     object_parts,
@@ -63,13 +63,10 @@ class _Frames(RootModel[dict[str, _Frame]]):
 
 
 @dataclass(frozen=True)
-class ScanNetPP:
-    """The `Reader` (source.py) of ScanNet++; a scene is a room."""
+class ScanNetPP(Reader):
+    """ScanNet++; a scene is a room."""
 
     name: ClassVar = "scannetpp"
-    label_set: ClassVar = LABEL_SET
-    room_type: ClassVar = "scannetpp"
-    folder: Path
 
     def settings(self) -> dict[str, Any]:
         """See `Reader.settings`."""
@@ -78,10 +75,6 @@ class ScanNetPP:
     def scenes(self) -> list[str]:
         """See `Reader.scenes`."""
         return sorted(path.parents[1].name for path in self.folder.glob(f"*/{_MESH}"))
-
-    def official_split(self, scene: str) -> str | None:
-        """See `Reader.official_split`."""
-        return None
 
     def rooms(self, scene: str) -> dict[str, FoundRoom]:
         """The scene as one room."""

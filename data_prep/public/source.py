@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 from data_prep.engine.plan import digest
 from data_prep.engine.selection import (
@@ -26,47 +26,11 @@ from data_prep.engine.workers import Run
 from data_prep.front.recipe import load_recipe
 from data_prep.public.blenderproc import BlenderProc
 from data_prep.public.hypersim import Hypersim
-from data_prep.public.rooms import FoundRoom, FramedRoom, prepare_room
+from data_prep.public.rooms import FoundRoom, Reader, prepare_room
 from data_prep.public.scannetpp import ScanNetPP
 from data_prep.public.structured3d import Structured3D
 from sceneprior.core.errors import InputError
 from sceneprior.render.offscreen import Renderer
-
-
-class Reader(Protocol):
-    """Knows the files of one data set: a frozen dataclass with its folder.
-
-    Attributes:
-        name: Name of the data set in `index.json`.
-        label_set: Name of the label set.
-        room_type: Type of the rooms; also in the shards' names.
-        folder: The folder of scenes.
-    """
-
-    @property
-    def name(self) -> str: ...
-    @property
-    def label_set(self) -> str: ...
-    @property
-    def room_type(self) -> str: ...
-    @property
-    def folder(self) -> Path: ...
-
-    def settings(self) -> dict[str, Any]:
-        """Settings that the shards depend on; checks the files that all scenes share."""
-
-    def scenes(self) -> list[str]:
-        """Names of the scenes' folders, sorted; rooms of one scene are in one split."""
-
-    def official_split(self, scene: str) -> str | None:
-        """Split of a scene, if the data set states it in the scene's name."""
-
-    def rooms(self, scene: str) -> dict[str, FoundRoom]:
-        """Rooms of a scene by id: the scene's name, or that with `_` and the room's."""
-
-    def read(self, task: RoomTask, max_side: int | None, max_views: int) -> FramedRoom:
-        """Read one room with at most so many views, its images shrunk to `max_side`."""
-
 
 _BLENDERPROC = "blenderproc"
 _READERS: dict[str, Callable[[Path], Reader]] = {

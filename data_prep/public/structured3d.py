@@ -16,7 +16,7 @@ bertjiazheng/Structured3D.
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from pydantic import BaseModel, RootModel
@@ -24,8 +24,7 @@ from pydantic import BaseModel, RootModel
 from data_prep.engine.source import RoomTask
 from data_prep.frames import Y_UP
 from data_prep.public.nyu40 import ids_and_classes
-from data_prep.public.rooms import FoundRoom, FramedRoom, box_of, chosen_frames, sampled
-from data_prep.scannet.labels import LABEL_SET
+from data_prep.public.rooms import FoundRoom, FramedRoom, Reader, box_of, chosen_frames, sampled
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
 from sceneprior.core.geometry.intrinsics import odd_field_of_view
@@ -72,17 +71,10 @@ class _Structure(BaseModel):
 
 
 @dataclass(frozen=True)
-class Structured3D:
-    """The `Reader` (source.py) of Structured3D's perspective views."""
+class Structured3D(Reader):
+    """Structured3D's perspective views."""
 
     name: ClassVar = "structured3d"
-    label_set: ClassVar = LABEL_SET
-    room_type: ClassVar = "structured3d"
-    folder: Path
-
-    def settings(self) -> dict[str, Any]:
-        """See `Reader.settings`."""
-        return {}
 
     def scenes(self) -> list[str]:
         """See `Reader.scenes`."""

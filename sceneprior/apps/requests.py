@@ -65,8 +65,6 @@ def load_request(path: str | Path) -> dict[str, Any]:
     where = f"{path} is not a request, which docs/requests.md describes"
     entry = checked(RequestFile, data, where)
     asked: dict[str, Any] = {"floor": entry.floor, "ceiling_m": entry.ceiling_m}
-    if isinstance(entry.floor, str):
-        asked["floor"] = entry.floor
     asked["openings"] = [
         each if isinstance(each, str) else each.model_dump(exclude_none=True)
         for each in entry.openings

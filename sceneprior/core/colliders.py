@@ -1,7 +1,7 @@
 """Convex bodies of objects, for physics: their solids, or convex parts of their meshes."""
 
 from functools import cache
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -31,10 +31,19 @@ _FILL = {
 }  # fmt: skip
 
 
+def support_of(item: SceneObject) -> Literal["ground", "wall", "ceiling"]:
+    """What an object is expected to rest on, by its class: lamps of the classes `HUNG` on the
+    ceiling, pieces of the classes `MOUNTED` on a wall if their lower face is above 0.4 m, and all
+    others on the ground or on an object."""
+    if item.label in HUNG:
+        return "ceiling"
+    bottom_m = item.center_m[1] - item.size_m[1] / 2
+    return "wall" if item.label in MOUNTED and bottom_m > MOUNTED_M else "ground"
+
+
 def is_fixed(item: SceneObject) -> bool:
     """True for objects that hang, which simulators hold in place."""
-    bottom_m = item.center_m[1] - item.size_m[1] / 2
-    return item.label in HUNG or (item.label in MOUNTED and bottom_m > MOUNTED_M)
+    return support_of(item) != "ground"
 
 
 def colliders(item: SceneObject) -> tuple[Solid | Mesh, ...]:
@@ -65,17 +74,14 @@ def convex_parts(mesh: Mesh) -> tuple[Mesh, ...]:
 def closed_components(mesh: Mesh) -> list[Mesh]:
     """The connected components of a mesh, if all are closed, with outward faces, and there are few;
     else the whole mesh."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
+    import trimesh
 
     faces = np.asarray(mesh.faces)
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    edges, sharing = np.unique(edges, axis=0, return_counts=True)
-    if (sharing != 2).any():
+    whole = trimesh.Trimesh(mesh.vertices_m, faces, process=False)
+    if not whole.is_watertight:
         return [mesh]
-    links = coo_matrix((np.ones(len(edges)), edges.T), shape=(len(mesh.vertices_m),) * 2)
-    of_vertex = connected_components(links, directed=False)[1]
-    of_face = of_vertex[faces[:, 0]] if len(faces) else of_vertex[:0]
+    links, vertices = whole.edges_unique, len(mesh.vertices_m)
+    of_face = trimesh.graph.connected_component_labels(links, vertices)[faces[:, 0]]
     names = np.unique(of_face)
     if len(names) > MOST_COMPONENTS:
         return [mesh]

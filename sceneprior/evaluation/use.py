@@ -1,7 +1,7 @@
 """Metrics of use of sets of rooms: collisions, support, free floor, doors, volumes, stability."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -52,8 +52,6 @@ class Used:
     columns: dict[str, dict[str, Estimate]]
     left_out: dict[str, str]
     """What generated rooms lack, by key."""
-    counts: dict[str, int] = field(default_factory=dict)
-    """Rooms of each set."""
 
 
 def measure_use(
@@ -81,7 +79,7 @@ def measure_use(
     for found in columns.values():
         for key in missing:
             del found[key]
-    return Used(columns, reasons, {name: len(scenes) for name, scenes in sets.items()})
+    return Used(columns, reasons)
 
 
 def measure_room(scene: Scene, options: UseOptions) -> Counts:
@@ -176,7 +174,7 @@ def evaluate_use(
     floors = sum(scene.floor_m is not None for scene in generated)
     result["protocol"] = {
         **scores["protocol"],
-        **{f"n_{name}": count for name, count in found.counts.items()},
+        **{f"n_{name}": len(scenes) for name, scenes in sets.items()},
         "left_out": {**scores["protocol"].get("left_out", {}), **found.left_out},
         "use": {
             **use_definitions(),

@@ -6,16 +6,30 @@ from dataclasses import replace
 from pathlib import Path
 
 from sceneprior.core.errors import InputError
+from sceneprior.core.files import write_whole
 from sceneprior.core.scene import Scene
-from sceneprior.core.shell import ShellName, shell_of
+from sceneprior.core.shell import ShellName, shell_meshes, shell_of
 from sceneprior.core.standing import stand
 from sceneprior.interchange.atiss import write_atiss
 from sceneprior.interchange.front import write_front
 from sceneprior.interchange.habitat import write_habitat
-from sceneprior.interchange.mujoco import write_mujoco
 from sceneprior.interchange.sceneeval import write_sceneeval
-from sceneprior.interchange.usd import write_usd
 from sceneprior.render.scene_files import check_names, save_scene
+from sceneprior.render.scene_mjcf import scene_to_mjcf
+from sceneprior.render.scene_usd import scene_to_usd
+
+
+def _write_mujoco(scenes: Sequence[Scene], folder: Path, shell: ShellName) -> None:
+    for scene in scenes:  # the floor is always written
+        room = shell_of(scene) if shell == "walls" else None
+        write_whole(folder / f"{scene.name}.xml", scene_to_mjcf(scene, room))
+
+
+def _write_usd(scenes: Sequence[Scene], folder: Path, shell: ShellName) -> None:
+    for scene in scenes:
+        text = scene_to_usd(scene, shell_meshes(scene, shell), physics=True)
+        write_whole(folder / f"{scene.name}.usda", text)
+
 
 CLASS_FORMATS: Mapping[str, Callable[[Sequence[Scene], Path], None]] = {
     "atiss": write_atiss,
@@ -23,8 +37,8 @@ CLASS_FORMATS: Mapping[str, Callable[[Sequence[Scene], Path], None]] = {
 }
 """Formats that require a furniture class for each object, so that void objects are left out."""
 SIMULATORS: Mapping[str, Callable[[Sequence[Scene], Path, ShellName], None]] = {
-    "mujoco": write_mujoco,
-    "usd": write_usd,
+    "mujoco": _write_mujoco,
+    "usd": _write_usd,
     "habitat": write_habitat,
 }
 """Formats of simulators; objects are made to stand before they are written (`core/standing.py`)."""

@@ -10,6 +10,7 @@ from torch import Tensor
 from sceneprior.core.classes import label_set, unknown_class
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene, SceneObject, quarter_turned
+from sceneprior.core.shell import rectangle
 from sceneprior.core.threads import single_threaded
 from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.lifting.lifted import HANGS_M
@@ -80,7 +81,10 @@ def scene_of(trained: TrainedLifted, name: str, rooms: RoomBoxes, row: int) -> S
             confidence=float(confidence[item])
         )
         objects.append(SceneObject(label, center, size, mesh, turned if known else None, solids))
-    floor_m = None if rooms.rectangle_m is None else _outline(rooms.rectangle_m[row])
+    floor_m = None
+    if rooms.rectangle_m is not None:
+        middle, extents = rooms.rectangle_m[row].double().numpy().reshape(2, 2)
+        floor_m = rectangle(middle - extents / 2, middle + extents / 2).round(3)
     return Scene(name, trained.config.label_set, tuple(objects), floor_m)
 
 
@@ -96,13 +100,6 @@ def _down_to_floor(
     # Parts keep their order from bottom to top, so the share of empty height is lowest / top.
     height = top / (1 - lowest / top)
     return np.array([box_m[0], top - height / 2, box_m[2], box_m[3], height, box_m[5]])
-
-
-def _outline(rectangle_m: Float[Tensor, "4"]) -> Float[np.ndarray, "4 2"]:
-    """Corners (x, z) of a rectangle, to millimetres."""
-    center, extents = rectangle_m.double().numpy().reshape(2, 2)
-    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
-    return np.asarray((center + corners * extents).round(3))
 
 
 def class_rows(trained: TrainedLifted, labels: Sequence[str]) -> Int[Tensor, "1 labels"]:

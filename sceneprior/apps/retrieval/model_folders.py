@@ -99,8 +99,6 @@ def _labels_of_shards(folder: Path, label_set_name: str) -> dict[str, str]:
 
 def _own_folders(folder: Path) -> list[Path]:
     """Sub-folders that hold a GLB or an OBJ, sorted."""
-    if not folder.is_dir():
-        return []
     return sorted(path for path in folder.iterdir() if path.is_dir() and _own_files(path))
 
 

@@ -49,13 +49,15 @@ class Drawing:
             "/plan/ground", color=_GROUND, dimensions=(GROUND_M, 0.02, GROUND_M),
             position=(0, -0.05, 0), cast_shadow=False,
         )  # fmt: skip
-        self._on_click(ground, self._put)
+        self._on_click(ground, self._with_opening)
 
     def show(self, plan: Plan | None) -> None:
         """Show a plan to draw on; None hides the drawing."""
         self.plan = plan
         self.frame.visible = plan is not None
-        self._remove(self._nodes.copy())
+        for node in self._nodes.values():
+            node.remove()
+        self._nodes.clear()
         if plan is not None:
             self._draw(plan)
 
@@ -76,7 +78,7 @@ class Drawing:
             "/plan/floor", mesh.vertices_m, mesh.faces, color=FLOOR_COLOR, flat_shading=True,
             cast_shadow=False,
         )  # fmt: skip
-        self._on_click(floor, self._put)
+        self._on_click(floor, self._with_opening)
         ends = np.array([[side.start_m, side.end_m] for side in plan.sides])
         lines = self._scene.add_line_segments(
             "/plan/outline", np.insert(ends, 1, _LOW_M, axis=2), WALL, thickness=4,
@@ -104,7 +106,7 @@ class Drawing:
             wxyz=(np.cos(half), 0.0, np.sin(half), 0.0), cast_shadow=False,
         )  # fmt: skip
         self._nodes[node.name] = node
-        self._on_click(node, lambda _: self._without_opening(row))
+        self._on_click(node, lambda plan, _: plan.without_opening(row))
         self._on_drag(node, lambda at, end: self._drag_opening(row, at, end))
 
     def _handle(
@@ -119,16 +121,16 @@ class Drawing:
         row = int(number)
         self._on_drag(node, lambda at, end: self._drag_corner(kind, row, at, end))
         if kind == "corner":
-            self._on_click(node, lambda _: self._without_corner(row))
+            self._on_click(node, lambda plan, _: plan.without_corner(row))
 
     # -- Events: asynchronous callbacks keep their order, and changing a plan takes no time --------
 
-    def _on_click(self, node: Any, task: Callable[[Point], None]) -> None:
+    def _on_click(self, node: Any, changed: Callable[[Plan, Point], Plan]) -> None:
         @node.on_click
         async def _(event: Any) -> None:
             point = ground_point(event.ray_origin, event.ray_direction)
             if point is not None and self.plan is not None:
-                task(point)
+                self._change(changed(self.plan, point))
 
     def _on_drag(self, node: Any, task: Callable[[Point, bool], None]) -> None:
         @node.on_drag("left")
@@ -142,17 +144,8 @@ class Drawing:
         self.show(plan)
         self._changed(plan)
 
-    def _put(self, at: Point) -> None:
-        assert self.plan is not None, "a plan is shown"
-        self._change(self.plan.with_opening(self.kind, at))
-
-    def _without_corner(self, row: int) -> None:
-        assert self.plan is not None, "a plan is shown"
-        self._change(self.plan.without_corner(row))
-
-    def _without_opening(self, row: int) -> None:
-        assert self.plan is not None, "a plan is shown"
-        self._change(self.plan.without_opening(row))
+    def _with_opening(self, plan: Plan, at: Point) -> Plan:
+        return plan.with_opening(self.kind, at)
 
     def _drag_corner(self, kind: str, row: int, at: Point, ends: bool) -> None:
         """Move a corner, or a new one from the middle of a side."""
@@ -183,11 +176,6 @@ class Drawing:
         else:
             x, z = self.plan.ends_m(self.plan.openings[row]).mean(axis=0)
             self._nodes[f"/plan/opening_{row}"].position = (x, _LOW_M, z)
-
-    def _remove(self, nodes: dict[str, Any]) -> None:
-        for name, node in nodes.items():
-            node.remove()
-            del self._nodes[name]
 
 
 def ground_point(origin_m: Any, direction: Any) -> Point | None:

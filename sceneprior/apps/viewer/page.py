@@ -174,15 +174,12 @@ class Page:
         def update(camera: Any) -> None:
             nonlocal aspect
             own = self._eyes.get(client.client_id)
-            if own is None or (
-                abs(camera.aspect - aspect) > 0.01 and np.allclose(camera.position, own, atol=0.02)
-            ):
-                aspect = camera.aspect
+            reshaped = abs(camera.aspect - aspect) > 0.01
+            aspect = camera.aspect
+            if own is None or (reshaped and np.allclose(camera.position, own, atol=0.02)):
                 plan = self.panel.plan
                 points_m = self._points() if plan is None else self._plan_points(plan)
                 self._place(client, points_m, DOWN if plan is not None else self._direction)
-            else:
-                aspect = camera.aspect
 
         update(client.camera)
         client.camera.on_update(update)

@@ -81,9 +81,8 @@ class Plan:
     def ends_m(self, opening: Placed) -> Float[np.ndarray, "2 2"]:
         """Both ends (x, z) of an opening."""
         side = self.sides[opening.side]
-        along = (side.end_m - side.start_m) / side.length_m
         reach = opening.at_m + opening.width_m / 2 * np.array([[-1], [1]])
-        return np.asarray(side.start_m + reach * along)
+        return np.asarray(side.start_m + reach * side.along)
 
     def with_moved(self, corner: int, to: Point) -> "Plan":
         """A corner moved to the nearest place of the grid."""
@@ -189,8 +188,7 @@ def plan_of(floor: str, openings: str) -> Plan:
     for each, text in zip(wanted, openings.split(","), strict=False):
         if isinstance(each, WantedOpening) and each.at_m is not None:
             side = walls_of(each, plan.sides)[0]
-            along = (side.end_m - side.start_m) / side.length_m
-            x, z = side.start_m + each.at_m * along
+            x, z = side.start_m + each.at_m * side.along
             number, at_m = plan._on_wall((x, z))
             if not 0 <= each.at_m <= side.length_m:
                 raise InputError(

@@ -1,5 +1,7 @@
 """Objects that collide, by their meshes: SceneEval's COL, and PhyScene's Col_obj and Col_scene."""
 
+from itertools import combinations
+
 import numpy as np
 from jaxtyping import Bool
 
@@ -83,8 +85,7 @@ def containing(scene: Scene) -> Bool[np.ndarray, " objects"]:
 def _near_pairs(surfaces: list[Triangles]) -> list[tuple[int, int]]:
     return [
         (first, second)
-        for first in range(len(surfaces))
-        for second in range(first + 1, len(surfaces))
+        for first, second in combinations(range(len(surfaces)), 2)
         if _boxes_meet(surfaces[first], surfaces[second])
     ]
 

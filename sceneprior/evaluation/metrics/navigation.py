@@ -67,12 +67,11 @@ def floor_map(scene: Scene, robot_m: float) -> FloorMap | None:
 
     floor = drawn(corners)
     places = [footprint(item) for item in scene.objects]
-    none = np.zeros((0, PIXELS, PIXELS), dtype=bool)
-    boxes = np.array([drawn(place) for place in places], dtype=bool)
-    grown = np.array([drawn(place, width) for place in places], dtype=bool)
+    boxes, grown = (
+        np.array([drawn(place, line) for place in places], dtype=bool).reshape(-1, PIXELS, PIXELS)
+        for line in (0, width)
+    )
     eroded = cv2.erode(floor, np.ones((width, width))) if width else floor
-    if not places:
-        boxes = grown = none
     return FloorMap(floor.astype(bool), boxes, grown, np.asarray(eroded).astype(bool))
 
 

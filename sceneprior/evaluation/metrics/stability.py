@@ -1,6 +1,5 @@
 """Share of objects that stay where they are under gravity, simulated by MuJoCo."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -58,13 +57,6 @@ def settle(scene: Scene, seconds: float = SECONDS) -> Settled:
     moved = np.linalg.norm(state.xpos[bodies] - start, axis=1)
     alike = np.abs((state.xquat[bodies] * turned).sum(axis=1)).clip(max=1)
     return Settled(moved, 2 * np.arccos(alike), max(depth, 0.0))
-
-
-def stable_share(scenes: Sequence[Scene]) -> float | None:
-    """Share of the objects of all scenes that are stable; None without objects."""
-    found = np.array([stable_count(scene)["stable_share"] for scene in scenes]).reshape(-1, 2)
-    stable, objects = found.sum(axis=0)
-    return float(stable / objects) if objects else None
 
 
 def stable_count(scene: Scene) -> Counts:

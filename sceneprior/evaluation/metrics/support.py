@@ -1,12 +1,10 @@
 """Objects that rest on something: SceneEval's SUPPORT, with a table of classes."""
 
-from typing import Literal
-
 import numpy as np
 import shapely
 from jaxtyping import Bool, Float
 
-from sceneprior.core.colliders import HUNG, MOUNTED, MOUNTED_M
+from sceneprior.core.colliders import support_of
 from sceneprior.core.floor import floor_rectangle
 from sceneprior.core.geometry.turns import yaw_rotation
 from sceneprior.core.scene import Scene, SceneObject
@@ -31,18 +29,6 @@ PER_M2, FEWEST, MOST = 256, 32, 100_000
 """Rays per square metre of the largest such face, per face at least, and per object at most."""
 HIGH_M = 100.0
 """Height of walls whose ceiling is not known."""
-
-Support = Literal["ground", "wall", "ceiling"]
-
-
-def support_of(item: SceneObject) -> Support:
-    """What an object is expected to rest on, by its class: lamps of the classes `HUNG` on the
-    ceiling, pieces of the classes `MOUNTED` on a wall if their lower face is above 0.4 m, and all
-    others on the ground or on an object."""
-    if item.label in HUNG:
-        return "ceiling"
-    bottom_m = item.center_m[1] - item.size_m[1] / 2
-    return "wall" if item.label in MOUNTED and bottom_m > MOUNTED_M else "ground"
 
 
 def supported(scene: Scene) -> Float[np.ndarray, " objects"]:

@@ -48,7 +48,8 @@ def sample_requested(
         )
     assert with_sampler.sampler is not None, "checked by drawn_by_sampler"
     classes = label_set(with_sampler.config.label_set)
-    request = _parsed(with_sampler, asked)
+    known = [classes[row] for row in with_sampler.sampler.drawn_classes]
+    request = make_request(known, with_sampler.config.label_set, **asked)
     for item in request.objects:
         if item.label not in classes[1:]:
             raise InputError(
@@ -76,13 +77,6 @@ def _told(value: Any) -> Any:
     if isinstance(value, Sequence) and not isinstance(value, str):
         return [_told(each) for each in value]
     return value if isinstance(value, str | float | int | bool | None) else str(value)
-
-
-def _parsed(trained: TrainedLifted, asked: Mapping[str, Any]) -> Request:
-    assert trained.sampler is not None, "checked by drawn_by_sampler"
-    classes = label_set(trained.config.label_set)
-    known = [classes[row] for row in trained.sampler.drawn_classes]
-    return make_request(known, trained.config.label_set, **asked)
 
 
 def _scene(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from sceneprior.core.colliders import HUNG
 from sceneprior.core.errors import InputError
 from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.requests.particles import PARTICLES, Particles, start_particles
@@ -14,7 +15,8 @@ from sceneprior.lifted.requests.placement_rules import PlacementRules
 from sceneprior.lifted.requests.plans import RoomPlan, check_area, plan_room
 from sceneprior.lifted.requests.relation_checks import furniture_in
 from sceneprior.lifted.requests.request import Request
-from sceneprior.lifted.requests.steps import HANGING, Rejections, place_next
+from sceneprior.lifted.requests.shape import RoomShape
+from sceneprior.lifted.requests.steps import Rejections, place_next
 from sceneprior.lifted.requests.wishes import RelationWish, check_wishes
 from sceneprior.lifted.sampler.draw import LOOKS, with_looks
 from sceneprior.lifted.sampler.network import RoomSampler
@@ -100,11 +102,10 @@ def _given(
         labels, torch.ones_like(labels, dtype=torch.bool),
         torch.tensor(boxes_m).float().reshape(1, -1, 6),
     )  # fmt: skip
-    if request.outline_m is None:
-        extents_m = torch.tensor([[0.0, 0.0, 4.0, 4.0]])
-    else:
-        low, high = request.outline_m.min(axis=0), request.outline_m.max(axis=0)
-        extents_m = torch.from_numpy(np.concatenate([(low + high) / 2, high - low])[None]).float()
+    rectangle_m = np.array([0.0, 0.0, 4.0, 4.0])
+    if request.outline_m is not None:
+        rectangle_m = RoomShape(request.outline_m).rectangle_m
+    extents_m = torch.from_numpy(rectangle_m[None]).float()
     uniform = np.random.default_rng([seed, 0]).random((1, len(objects), 1 + LOOKS))
     none = torch.zeros(1, 0, dtype=torch.int64)
     return with_looks(
@@ -126,7 +127,7 @@ def _furnish(
     particles = start_particles(sampler, plans, given)
     objects = furniture_in(sampler, given, 0)
     rules = [PlacementRules(plan.shape, relations, classes, objects) for plan in plans]
-    hanging = [classes.index(label) for label in HANGING if label in classes]
+    hanging = [classes.index(label) for label in HUNG if label in classes]
     failed = [False] * len(plans)
     missing: list[list[int]] = [[] for _ in plans]
     for step in range(max((len(plan.upcoming) for plan in plans), default=0)):

@@ -148,8 +148,7 @@ def _placed(
             at_m = width_m / 2 + MARGIN_M + room_m[row] * draws.random()
         else:
             break
-        along = (side.end_m - side.start_m) / side.length_m
-        first, last = (side.start_m + along * (at_m + s * width_m / 2) for s in (-1, 1))
+        first, last = (side.start_m + side.along * (at_m + s * width_m / 2) for s in (-1, 1))
         line = shapely.LineString([first, last])
         if all(line.distance(other) >= MARGIN_M for other in taken):
             return Opening(wanted.kind, _pair(first), _pair(last), bottom_m, top_m)

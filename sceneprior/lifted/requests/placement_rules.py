@@ -1,7 +1,7 @@
 """Placement rules of a requested room: walls behind backs, ceiling, doors and windows, relations,
 and paths from the doors. Candidate places of an object are checked against all of them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import shapely
@@ -21,8 +21,6 @@ WALL_M = 0.3
 """Largest distance of the middle of such a back from a wall."""
 BEFORE_WINDOWS = ("lamp", "plant")
 """Words in the names of classes that may stand or hang before a window."""
-
-Check = Callable[[], Bool[np.ndarray, " candidates"]]
 
 
 class PlacementRules:
@@ -70,18 +68,18 @@ class PlacementRules:
         """
         allowed = np.ones(len(candidates.back), dtype=bool)
         reason = ""
-        checks: list[tuple[str, Check]] = [
-            ("a wall behind it", lambda: backed_by_walls(self.shape, candidates, rectangles_m)),
-            ("room below the ceiling", lambda: self._below_ceiling(candidates)),
-            ("distance from a door", lambda: self._leaves_free("door", label, candidates)),
-            ("distance from a window", lambda: self._leaves_free("window", label, candidates)),
-        ]
-        for name, check in checks:
-            allowed, reason = _narrowed(allowed, check(), reason, name)
+        for name, passed in {
+            "a wall behind it": backed_by_walls(self.shape, candidates, rectangles_m),
+            "room below the ceiling": self._below_ceiling(candidates),
+            "distance from a door": self._leaves_free("door", label, candidates),
+            "distance from a window": self._leaves_free("window", label, candidates),
+        }.items():
+            reason = reason or name * bool((allowed & ~passed).any())
+            allowed &= passed
         rows = np.flatnonzero(allowed)
-        possible = allowed.copy()
-        possible[rows] = self.relations.can_hold(label, candidates.rows(rows), placed, upcoming)
-        allowed, reason = _narrowed(allowed, possible, reason, "a place that its relations allow")
+        allowed[rows] = self.relations.can_hold(label, candidates.rows(rows), placed, upcoming)
+        if not allowed[rows].all():
+            reason = reason or "a place that its relations allow"
         if self._paths is None:
             return allowed, reason
         for row in np.flatnonzero(allowed):
@@ -118,17 +116,6 @@ class PlacementRules:
             level = (high_m > zone.from_m + 0.01) & (low_m < zone.to_m)
             free &= ~(level & shapely.intersects(floors, zone.polygon))
         return free
-
-
-def _narrowed(
-    allowed: Bool[np.ndarray, " candidates"],
-    passed: Bool[np.ndarray, " candidates"],
-    reason: str,
-    name: str,
-) -> tuple[Bool[np.ndarray, " candidates"], str]:
-    """The allowed places that pass a check, and the reason of the first rejection so far."""
-    failed = bool((allowed & ~passed).any())
-    return allowed & passed, reason or (name if failed else "")
 
 
 def backed_by_walls(

@@ -50,7 +50,11 @@ def plan_room(
     """
     given = [classes.index(item.label) for item in request.objects]
     required = required_rows(request.wishes, classes, given)
-    shape = _shape(sampler, request, [*given, *required], draws[0])
+    outline_m = request.outline_m
+    if outline_m is None:
+        outline_m = _drawn_outline(sampler, request, [*given, *required], draws[0])
+    openings = place_openings(outline_m, request.openings, draws[0])
+    shape = RoomShape(outline_m, openings, request.ceiling_m)
     uniform = draws[1].random(sampler.max_objects)
     upcoming = draw_contents(sampler, request.wishes, classes, given, shape.extents_m, uniform)
     is_required = np.arange(len(upcoming)) < len(required)
@@ -59,31 +63,21 @@ def plan_room(
     return RoomPlan(shape, [upcoming[k] for k in order], [bool(is_required[k]) for k in order])
 
 
-def _shape(
+def _drawn_outline(
     sampler: RoomSampler, request: Request, needed: list[int], draws: np.random.Generator
-) -> RoomShape:
-    if request.outline_m is not None:
-        return _with_openings(request.outline_m, request, draws)
+) -> np.ndarray:
     needed_m2 = float(sampler.footprints_m2[needed].sum()) / FULL_SHARE
     numbers = torch.from_numpy(draws.random((RECTANGLES, 5))).float()
     noise = torch.special.ndtri(numbers[:, 1:].clamp(1e-6, 1 - 1e-6))
     rectangles_m = sampler.rectangles(numbers[:, 0], noise).double().numpy()
     areas_m2 = rectangles_m[:, 2:].prod(axis=1)
     enough = areas_m2 >= needed_m2
-    x, z = rectangles_m[int(enough.argmax() if enough.any() else areas_m2.argmax()), 2:] / 2
+    half = rectangles_m[int(enough.argmax() if enough.any() else areas_m2.argmax()), 2:] / 2
     if request.objects:  # no wall may cross them
         boxes_m = np.array([[*item.center_m, *item.size_m] for item in request.objects])
         reach = (np.abs(boxes_m[:, [0, 2]]) + boxes_m[:, [3, 5]] / 2).max(axis=0)
-        x, z = max(x, reach[0]), max(z, reach[1])
-    half = np.array([x, z])
-    return _with_openings(rectangle(-half, half), request, draws)
-
-
-def _with_openings(
-    outline_m: np.ndarray, request: Request, draws: np.random.Generator
-) -> RoomShape:
-    openings = place_openings(outline_m, request.openings, draws)
-    return RoomShape(outline_m, openings, request.ceiling_m)
+        half = np.maximum(half, reach)
+    return rectangle(-half, half)
 
 
 def check_area(sampler: RoomSampler, request: Request, classes: tuple[str, ...]) -> None:

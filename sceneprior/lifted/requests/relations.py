@@ -151,11 +151,9 @@ def footprints(boxes_m: Float[np.ndarray, "boxes 6"]) -> np.ndarray:
 def _convex_corners(outline_m: Float[np.ndarray, "corners 2"]) -> Float[np.ndarray, "some 2"]:
     """Corners of a floor with an interior angle below 150 degrees."""
     sides = sides_of(outline_m)
-    along = [(side.end_m - side.start_m) / max(side.length_m, 1e-9) for side in sides]
     kept = []
-    for row, side in enumerate(sides):
-        before = along[row - 1]
-        turning = before @ along[row] < np.cos(np.pi / 6)
-        if turning and along[row] @ sides[row - 1].inward > 0:
+    for before, side in zip([sides[-1], *sides], sides, strict=False):
+        turning = before.along @ side.along < np.cos(np.pi / 6)
+        if turning and side.along @ before.inward > 0:
             kept.append(side.start_m)
     return np.array(kept).reshape(-1, 2)

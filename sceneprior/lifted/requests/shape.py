@@ -12,6 +12,7 @@ from jaxtyping import Float
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Opening
 from sceneprior.core.scene_json import check_floor, unit_guess
+from sceneprior.core.shell import rectangle
 
 NARROWEST_M = 0.3
 """Minimum side of a rectangle in which furniture is placed."""
@@ -91,17 +92,21 @@ class Side(NamedTuple):
         """Length of the side."""
         return float(np.linalg.norm(self.end_m - self.start_m))
 
+    @property
+    def along(self) -> Float[np.ndarray, "2"]:
+        """Unit vector from the start to the end."""
+        return np.asarray((self.end_m - self.start_m) / max(self.length_m, 1e-9))
+
 
 def sides_of(outline_m: Float[np.ndarray, "corners 2"]) -> list[Side]:
     """The sides of an outline, in order: the first leads from corner 0 to corner 1."""
     following = np.roll(outline_m, -1, axis=0)
     x, z = outline_m.T
     area = (x * following[:, 1] - following[:, 0] * z).sum()
-    sides = []
-    for start, end in zip(outline_m, following, strict=True):
-        along = (end - start) / max(np.linalg.norm(end - start), 1e-9)
-        sides.append(Side(start, end, np.array([-along[1], along[0]]) * np.sign(area)))
-    return sides
+    away = following - outline_m
+    along = away / np.linalg.norm(away, axis=1, keepdims=True).clip(min=1e-9)
+    inward = along[:, ::-1] * [-1, 1] * np.sign(area)
+    return [Side(*side) for side in zip(outline_m, following, inward, strict=True)]
 
 
 def read_floor(floor: str | Sequence[Any] | np.ndarray) -> np.ndarray:
@@ -152,27 +157,26 @@ def read_floor(floor: str | Sequence[Any] | np.ndarray) -> np.ndarray:
     return outline_m
 
 
-def _floor_of_text(text: str) -> list[tuple[float, float]]:
+def _floor_of_text(text: str) -> np.ndarray:
     """Corners that a text names by the floor's size, or one by one."""
     if (found := _SIZE.fullmatch(text)) is not None:
-        x, z = (float(side) / 2 for side in found.groups())
-        return [(-x, -z), (x, -z), (x, z), (-x, z)]
+        half = np.array([float(side) / 2 for side in found.groups()])
+        return rectangle(-half, half)
     numbers = [float(number) for number in _NUMBER.findall(text)]
     if _NUMBER.sub("", text).strip(" ,;[]()\n\t") or len(numbers) < 6 or len(numbers) % 2:
         raise InputError(
             f"The floor is '{text[:60]}'; expected its size in metres, such as 4x3, at least 3 "
             "corners x,z in order, such as '0,0 5,0 5,3 2,3 2,5 0,5', or a file with a floor."
         )
-    return list(zip(numbers[::2], numbers[1::2], strict=True))
+    return np.array(numbers).reshape(-1, 2)
 
 
 def inner_rectangles(polygon: shapely.Polygon) -> Float[np.ndarray, "rectangles 4"]:
     """The rectangles of `RoomShape.rectangles_m`. Their sides lie at corners of the floor or, for
     floors with slanted sides, at points every `SPACING_M` along the outline."""
-    lines = shapely.segmentize(polygon, SPACING_M).exterior.coords
-    points = np.array([*polygon.exterior.coords, *lines])
-    slanted = ~_axis_aligned(polygon)
-    corners = points if slanted else np.array(polygon.exterior.coords)
+    corners = np.array(polygon.exterior.coords)
+    if (np.abs(np.diff(corners, axis=0)).min(axis=1) >= 1e-3).any():  # a slanted side
+        corners = np.array([*corners, *shapely.segmentize(polygon, SPACING_M).exterior.coords])
     x, z = (np.unique(corners[:, axis].round(3)) for axis in (0, 1))
     if len(x) * len(z) > MOST_CELLS:
         raise InputError(
@@ -211,8 +215,3 @@ def inner_rectangles(polygon: shapely.Polygon) -> Float[np.ndarray, "rectangles 
             f"The floor is nowhere {NARROWEST_M:g} m wide along both axes; furniture has no place."
         )
     return np.concatenate([(low + high) / 2, high - low], axis=1)[kept]
-
-
-def _axis_aligned(polygon: shapely.Polygon) -> bool:
-    along = np.abs(np.diff(np.array(polygon.exterior.coords), axis=0))
-    return bool((along.min(axis=1) < 1e-3).all())

@@ -29,8 +29,6 @@ LOW_M = 0.15
 ON_FLOOR = 0.75
 """Probability of a bottom below `LOW_M` above which an object is set on the floor: in a small room,
 a particle with a bed in mid-air would survive."""
-HANGING = ("ceiling_lamp", "pendant_lamp")
-"""Classes that hang from a ceiling of known height."""
 
 Rejections = Counter[tuple[int, str]]
 """Number of places rejected for an object, by its class and the reason."""
@@ -63,7 +61,7 @@ def place_next(
 
     Args:
         rules, draws: Placement rules and random numbers of each room.
-        hanging: Indices of `HANGING`.
+        hanging: Indices of the classes that hang from a ceiling of known height.
         rejections: Counts to which rejected places are added.
     """
     chance = np.concatenate([each.random((PARTICLES, 7 + 4 * TRIES)) for each in draws])

@@ -106,7 +106,7 @@ def test_the_drawing_fills_the_fields_and_follows_them(prior):
         fields._draw_or_end()
         assert fields.floor.value == "4x3" and drawing.frame.visible
         assert not page._room.frame.visible
-        drawing._put((0.5, -1.3))
+        drawing._change(drawing.plan.with_opening(drawing.kind, (0.5, -1.3)))
         assert fields.openings.value == "door@0:2.5"
         drawing._drag_corner("corner", 2, (2.4, 2.1), False)
         drawing._drag_corner("corner", 2, (2.5, 2.0), True)
@@ -116,7 +116,7 @@ def test_the_drawing_fills_the_fields_and_follows_them(prior):
         assert fields.floor.value == "-2,-1.5 2,-1.5 2.5,2 -2,1.5 -2.6,0.2"
         drawing._drag_opening(0, (1.9, 0.0), True)
         assert fields.openings.value.startswith("door@1:")
-        drawing._without_corner(4)
+        drawing._change(drawing.plan.without_corner(4))
         fields.openings.value = "window@0:1"  # typed
         assert [each.kind for each in drawing.plan.openings] == ["window"]
         fields.floor.value = "5x"  # half-typed

@@ -7,7 +7,7 @@ from rooms_of_solids import solid_box
 from sceneprior.apps.api import load
 from sceneprior.core.scene import Scene, SceneObject, Solid
 from sceneprior.core.standing import stand
-from sceneprior.evaluation.metrics.stability import settle, stable_share
+from sceneprior.evaluation.metrics.stability import settle, stable_count
 
 pytest.importorskip("mujoco", reason="no mujoco here: pip install -e '.[sim]'")
 
@@ -30,8 +30,8 @@ def test_overlaps_at_the_start_are_measured():
     """Two boxes 10 cm into each other."""
     pair = (solid_box("table", (0, 0.5, 0), (1, 1, 1)), solid_box("desk", (0.9, 0.5, 0), (1, 1, 1)))
     assert settle(Scene("room", "front3d_bedroom", pair), 0.01).penetration_m == pytest.approx(0.1)
-    assert stable_share([Scene("room", "front3d_bedroom", pair)]) < 1
-    assert stable_share([Scene("room", "front3d_bedroom")]) is None
+    assert stable_count(Scene("room", "front3d_bedroom", pair))["stable_share"] < (2, 2)
+    assert stable_count(Scene("room", "front3d_bedroom"))["stable_share"] == (0, 0)
 
 
 @pytest.mark.parametrize("name", ["procthor-bedroom", "procthor-living", "demo-bedroom"])
