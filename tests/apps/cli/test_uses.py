@@ -103,7 +103,7 @@ def test_complete(command, toy_run, rooms, tmp_path):
     assert not (tmp_path / "many").exists()
 
 
-def test_a_sampler_s_rooms_have_no_latents(command, sampler_run, tmp_path):
+def test_a_sampler_s_rooms_have_no_latents(command, sampler_run, tmp_path, few_attempts):
     call = ["synthesize", "--run", sampler_run, "-n", 2]
     assert command(*call, "--out", "drawn")[0] == 0
     assert command(*call, "--out", "decoded", "--distribution", "paper")[0] == 0
@@ -112,7 +112,7 @@ def test_a_sampler_s_rooms_have_no_latents(command, sampler_run, tmp_path):
     assert (tmp_path / "drawn" / "seed0_0001.json").exists()
 
 
-def test_complete_adds_what_is_asked_for(command, sampler_run, tmp_path):
+def test_complete_adds_what_is_asked_for(command, sampler_run, tmp_path, few_attempts):
     empty = {
         "format": "sceneprior-scene", "version": 1, "name": "mine", "objects": [],
         "label_set": "front3d_bedroom", "floor_m": [[-2, -2], [2, -2], [2, 2], [-2, 2]],
