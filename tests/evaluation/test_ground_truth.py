@@ -8,11 +8,7 @@ import pytest
 from toy_rooms import write_shard
 
 from sceneprior.core.errors import InputError, ShardError
-from sceneprior.core.ground_truth import (
-    independent_rooms,
-    reference_scenes,
-    shuffled_rooms,
-)
+from sceneprior.core.ground_truth import independent_rooms, reference_scenes, shuffled_rooms
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.evaluation.metrics.contents import class_frequencies, object_counts
 from sceneprior.evaluation.room_sets import seeded_rows, without_void

@@ -110,10 +110,7 @@ def shrunk(scene: Scene) -> Scene:
     return replace(
         scene,
         objects=tuple(
-            replace(
-                item,
-                mesh=Mesh((item.mesh.vertices_m + item.center_m) / 2, item.mesh.faces),
-            )
+            replace(item, mesh=Mesh((item.mesh.vertices_m + item.center_m) / 2, item.mesh.faces))
             for item in scene.objects
         ),
     )

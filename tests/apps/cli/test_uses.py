@@ -80,7 +80,8 @@ def test_retrieve(command, rooms, tmp_path):
     assert "cache holds no scene JSON" in said and not (tmp_path / "new").exists()
 
 
-def test_complete(command, toy_run, rooms, tmp_path):
+def test_complete(command, toy_run, rooms, tmp_path, monkeypatch):
+    monkeypatch.setattr("sceneprior.lifted.complete.RESTARTS", 1)
     scene = json.loads((rooms / "seed0_0001.json").read_text())
     scene["objects"] = scene["objects"][:1]
     given = tmp_path / "given.json"

@@ -13,18 +13,8 @@ from tiny_runs import tiny_baseline_settings, write_tiny_config
 from toy_metrics import without_classifiers
 
 from sceneprior.apps.config import load_any_run, load_config
-from sceneprior.apps.experiments.compare import (
-    Compared,
-    CompareOptions,
-    compare,
-    scoring_steps,
-)
-from sceneprior.apps.experiments.comparison import (
-    load_comparison,
-    part_of,
-    runs_of,
-    variants_of,
-)
+from sceneprior.apps.experiments.compare import Compared, CompareOptions, compare, scoring_steps
+from sceneprior.apps.experiments.comparison import load_comparison, part_of, runs_of, variants_of
 from sceneprior.apps.experiments.rows import costs_of
 from sceneprior.apps.experiments.steps import StepRunner
 from sceneprior.core.errors import InputError

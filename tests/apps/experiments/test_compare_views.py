@@ -37,10 +37,7 @@ def write_comparison(folder: Path, shards: Path, **changes) -> str:
         "views": 2,
         "cad_models": "shards",
         "rooms": {"toy": {"title": "Toys", "config": str(folder / "tiny.yaml")}},
-        "methods": {
-            "usl": {"title": "USL", "config": str(folder / "usl.yaml")},
-            "ours": {},
-        },
+        "methods": {"usl": {"title": "USL", "config": str(folder / "usl.yaml")}, "ours": {}},
     }
     (folder / "compare.yaml").write_text(yaml.safe_dump(data | changes, sort_keys=False))
     return str(folder / "compare.yaml")
