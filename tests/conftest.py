@@ -139,6 +139,12 @@ def sampler_run(toy_shards: Path, made_once: Callable[..., Path]) -> Path:
 
 
 @pytest.fixture
+def few_attempts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Samplers give up on a room early: an untrained one finds places for its furniture late."""
+    monkeypatch.setattr("sceneprior.lifted.sampler.draw.ROUNDS", 2)
+
+
+@pytest.fixture
 def grid_prior(trained):
     """The toy run's prior with occupancy grids for shapes, which are untrained."""
     from sceneprior.lifted.trained import TrainedLifted

@@ -2,10 +2,12 @@
 
 import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 from typing import NamedTuple
+
+from typer.testing import CliRunner
+
+from sceneprior.apps.cli.commands import app
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -60,10 +62,7 @@ def run_first_commands(page: Path) -> list[str]:
     said = []
     for command, *words in commands_of(first_block(page, "bash")):
         assert command == "sceneprior"
-        done = subprocess.run(
-            [sys.executable, "-m", "sceneprior", *words],
-            capture_output=True, text=True, timeout=600,
-        )  # fmt: skip
-        assert done.returncode == 0, f"{words}\n{done.stderr[-2000:]}"
+        done = CliRunner().invoke(app, words)
+        assert done.exit_code == 0, f"{words}\n{done.output[-2000:]}\n{done.exception}"
         said.append(done.stdout)
     return said

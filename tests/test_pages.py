@@ -29,6 +29,7 @@ from model_folder import blocks, write_models
 from pages import PAGES, ROOT, Block, blocks_of, commands_of, name_of
 from PIL import Image
 from posed_files import PosedRoom, furniture
+from toy_metrics import without_classifiers
 
 from data_prep.homes.make import make_homes
 from sceneprior.apps import cli
@@ -259,7 +260,8 @@ def carry_out(words: list[str], toys: Toys, monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", RUN_HERE)
-def test_commands_run_as_printed(page: str, toys: Toys, tmp_path: Path, monkeypatch):
+def test_commands_run_as_printed(page: str, toys: Toys, tmp_path: Path, monkeypatch, few_attempts):
+    without_classifiers(monkeypatch)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("SCENEPRIOR_RENDERER", "software")

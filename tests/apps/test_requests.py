@@ -51,10 +51,7 @@ def test_a_file_asks_what_its_keys_say(prior, tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (
-            {"objects": [{**BED, "size_m": [180, 60, 200]}]},
-            "20 m long.*Are these centimetres",
-        ),
+        ({"objects": [{**BED, "size_m": [180, 60, 200]}]}, "20 m long.*Are these centimetres"),
         ({"floor": [[0, 0], [1, 2]]}, "floor.*at least 3 items"),
         ({"doors": 1}, "doors is 1; extra inputs are not permitted"),
         ({"version": 2}, "version is 2; input should be 1"),

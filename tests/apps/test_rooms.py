@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sceneprior.apps.rooms import (
-    OVERVIEW_TILE,
-    overview,
-    write_scene,
-    write_scenes,
-)
+from sceneprior.apps.rooms import OVERVIEW_TILE, overview, write_scene, write_scenes
 from sceneprior.core.scene import Scene, SceneObject
 
 

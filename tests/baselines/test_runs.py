@@ -5,6 +5,7 @@ import csv
 import pytest
 import torch
 from interrupting import CPU, interrupted
+from toy_metrics import without_classifiers
 from typer.testing import CliRunner
 
 from sceneprior.apps.cli.commands import app
@@ -31,6 +32,11 @@ LOGGED = {
 """Curves of the last stage of each baseline, beside its loss."""
 STAGES = {name: (name,) for name in LOGGED} | {"atiss2d": ("layout", "shape")}
 WITHOUT_LATENTS = ("gan", "atiss", "sync2gen", "set_flow")
+
+
+@pytest.fixture(autouse=True)
+def no_classifier(monkeypatch: pytest.MonkeyPatch) -> None:
+    without_classifiers(monkeypatch)
 
 
 @pytest.mark.parametrize("method", LOGGED)
@@ -75,7 +81,7 @@ def test_the_command_line_trains_generates_and_evaluates(baseline_config, method
     for words in (
         ["fit", "--config", str(config), "--run", str(run), "--accelerator", "cpu"],
         ["synthesize", "--run", str(run), "-n", "3", "--out", str(tmp_path / "rooms")],
-        ["eval-fid", "--run", str(run), "-n", "4"],
+        ["eval-fid", "--run", str(run), "-n", "4", "--resamples", "5"],
     ):  # fmt: skip
         result = CliRunner().invoke(app, words)
         assert result.exit_code == 0, result.output
@@ -106,7 +112,7 @@ def test_new_rooms_depend_on_the_seed_alone(baseline_run, method):
 
 @pytest.mark.parametrize("method", WITHOUT_LATENTS)
 def test_a_run_is_evaluated_and_reported_by_its_new_rooms_alone(baseline_run, method, tmp_path):
-    run, options = baseline_run(method), EvalOptions()
+    run, options = baseline_run(method), EvalOptions(resamples=5)
     scores = evaluate_run(run, 4, options, tmp_path / "scores.json")
     assert scores["protocol"]["stage"] == method
     assert scores["protocol"]["latents"] == ("paper" if method == "gan" else "its own")

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
-from front_files import FrontFolder
+from front_files import FrontFolder, four_models
 from typer.testing import CliRunner
 
 from data_prep.cli import add_commands
@@ -14,12 +14,7 @@ from data_prep.cli import add_commands
 @pytest.fixture
 def front(tmp_path: Path) -> FrontFolder:
     """A folder with four models and no house yet."""
-    folder = FrontFolder(tmp_path / "data")
-    folder.model("bed", "King-size Bed", (1.8, 1.0, 2.0))
-    folder.model("stand", "Nightstand", (0.5, 0.6, 0.4))
-    folder.model("lamp", "Floor Lamp", (0.3, 1.5, 0.3))
-    folder.model("pendant", "Pendant Lamp", (0.4, 0.5, 0.4))
-    return folder
+    return four_models(tmp_path / "data")
 
 
 @pytest.fixture

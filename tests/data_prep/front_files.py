@@ -59,6 +59,16 @@ class FrontFolder:
         return path
 
 
+def four_models(root: Path) -> FrontFolder:
+    """Models for the rooms below, and no house yet."""
+    folder = FrontFolder(root)
+    folder.model("bed", "King-size Bed", (1.8, 1.0, 2.0))
+    folder.model("stand", "Nightstand", (0.5, 0.6, 0.4))
+    folder.model("lamp", "Floor Lamp", (0.3, 1.5, 0.3))
+    folder.model("pendant", "Pendant Lamp", (0.4, 0.5, 0.4))
+    return folder
+
+
 def surface(uid: str, kind: str, corners: list[tuple[float, float, float]]) -> dict[str, Any]:
     """A quad as 3D-FRONT writes it: flat lists of numbers."""
     return {

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-from front_files import FrontFolder, bedroom
+from front_files import FrontFolder, bedroom, four_models
 
-from data_prep.engine.build import Job
+from data_prep.engine.build import Job, build_shards
 from data_prep.front.recipe import load_recipe
 from data_prep.front.source import FrontSource
 from sceneprior.core.shard_writing import room_checksum
@@ -31,6 +31,19 @@ def three_houses(front: FrontFolder) -> None:
     """Six bedrooms."""
     for k in range(3):
         front.house(f"house{k}", bedroom(f"Bedroom-{k}"), bedroom(f"MasterBedroom-{k}"))
+
+
+def bedroom_shards(folder: Path, *rules: str) -> None:
+    """Shards of one bedroom."""
+    front = four_models(folder.parent / f"{folder.name}.data")
+    front.house("house", bedroom("Bedroom-0"))
+    build_shards(front_job(front, folder, rules=rules, only="house"))
+
+
+def six_bedrooms_shards(folder: Path, *rules: str) -> None:
+    front = four_models(folder.parent / f"{folder.name}.data")
+    three_houses(front)
+    build_shards(front_job(front, folder, rules=rules))
 
 
 def digests(folder: Path, *patterns: str) -> dict[str, str]:

@@ -73,17 +73,10 @@ def test_pictures_and_wrong_words(front, tmp_path, prep, cli):
     made = prep("--rgb")
     assert made.exit_code == 3 and "its instanceid, '[/] [bold]'" in made.stdout, made.output
     assert len(list((tmp_path / "shards" / "rgb").glob("*/0000.png"))) == 6
-    for words, said in (
-        (("--recipe", "attic"), "No recipe is called 'attic'; choose from all, atiss_bedroom,"),
-        (
-            ("--rule", "max_floor_m=wide"),
-            "'max_floor_m': input should be a valid number (got 'wide')",
-        ),
-        (("--recipe", "library"), "selects (library); the folder has Bedroom (7)"),
-    ):
-        result = cli(
-            "prep-front", "--front", front.front, "--future", front.future,
-            "--out", tmp_path / "other", "--workers", 1, "--renderer", "software", *words,
-        )  # fmt: skip
-        assert result.exit_code and said in str(result.exception)
-        assert not (tmp_path / "other").exists()
+    result = cli(
+        "prep-front", "--front", front.front, "--future", front.future,
+        "--out", tmp_path / "other", "--workers", 1, "--recipe", "library",
+    )  # fmt: skip
+    assert result.exit_code
+    assert "selects (library); the folder has Bedroom (7)" in str(result.exception)
+    assert not (tmp_path / "other").exists()

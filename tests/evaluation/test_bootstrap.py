@@ -3,12 +3,7 @@
 import numpy as np
 import pytest
 
-from sceneprior.evaluation.bootstrap import (
-    COVERAGE,
-    Estimate,
-    ratio,
-    resample_counts,
-)
+from sceneprior.evaluation.bootstrap import COVERAGE, Estimate, ratio, resample_counts
 from sceneprior.evaluation.metrics.frechet import frechet_distance
 
 

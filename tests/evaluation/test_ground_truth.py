@@ -1,4 +1,4 @@
-"""Ground truth of the shards as scenes; independent rooms keep every marginal, lose the rest."""
+"""Ground truth of the shards as scenes, and the sets of rooms drawn from them."""
 
 import shutil
 from dataclasses import replace
@@ -8,13 +8,10 @@ import pytest
 from toy_rooms import write_shard
 
 from sceneprior.core.errors import InputError, ShardError
-from sceneprior.core.ground_truth import (
-    independent_rooms,
-    reference_scenes,
-    shuffled_rooms,
-)
+from sceneprior.core.ground_truth import independent_rooms, reference_scenes, shuffled_rooms
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.evaluation.metrics.contents import class_frequencies, object_counts
+from sceneprior.evaluation.room_sets import seeded_rows, without_void
 from sceneprior.render.topdown import topdown
 
 MESH = Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
@@ -128,3 +125,14 @@ def test_shuffled_rooms_keep_what_a_room_holds_and_take_places_from_all_rooms(rn
     assert all(item.mesh is None for room in shuffled for item in room.objects)
     assert shuffled == shuffled_rooms(real, 6, 0) != shuffled_rooms(real, 6, 1)
     assert len(shuffled_rooms(real, 2, 0)) == 2
+
+
+def test_void_is_left_out_and_subsets_are_seeded(shards):
+    real = reference_scenes(shards, "test", limit=1)[0]
+    void = SceneObject("void", (0.0, 0.5, 0.0), (1.0, 1.0, 1.0))
+    scene = replace(real, objects=(void, *real.objects))
+    assert without_void(scene) == real
+    rows = seeded_rows(20, 5, 0)
+    assert rows == seeded_rows(20, 5, 0) == sorted(set(rows)) and len(rows) == 5
+    assert rows != seeded_rows(20, 5, 1) and set(rows) < set(range(20))
+    assert seeded_rows(20, 50, 0) == list(range(20))

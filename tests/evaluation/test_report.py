@@ -9,6 +9,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from PIL import Image
+from toy_metrics import without_classifiers
 
 from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.palette import quiet_colors
@@ -29,7 +30,9 @@ def generated(shards) -> list[Scene]:
 def page(shards, generated, tmp_path_factory) -> str:
     path = tmp_path_factory.mktemp("report") / "new" / "report.html"
     truth = reference_scenes(shards, "train", limit=2, tracked_only=True)
-    scores = evaluate_synthesis(generated, shards, EvalOptions())
+    with pytest.MonkeyPatch.context() as patch:
+        without_classifiers(patch)
+        scores = evaluate_synthesis(generated, shards, EvalOptions(resamples=20))
     scores |= {"class_accuracy": 0.991, "box_iou_3d": 0.74, "seconds": 600.0}
     write_report(
         path,

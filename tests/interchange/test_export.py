@@ -29,10 +29,7 @@ PYRAMID = Mesh(
 def scenes() -> list[Scene]:
     bed = SceneObject("double_bed", (-0.2, 0.5, 0.0), (1.6, 0.8, 2.0), PYRAMID)
     lamp = SceneObject("pendant_lamp", (1.0, 2.2, -0.5), (0.3, 0.4, 0.2))
-    return [
-        Scene("first", BEDROOM, (bed, lamp), FLOOR),
-        Scene("second", BEDROOM, (lamp,)),
-    ]
+    return [Scene("first", BEDROOM, (bed, lamp), FLOOR), Scene("second", BEDROOM, (lamp,))]
 
 
 def test_box_lists_come_back(scenes, tmp_path):

@@ -11,12 +11,7 @@ from torch.testing import assert_close
 from sceneprior.core.errors import InputError
 from sceneprior.core.observed_image import as_views, images_of_split, rows_of
 from sceneprior.paper import fit_image as fitting
-from sceneprior.paper.fit_image import (
-    FitSchedule,
-    decode_images,
-    fit_latents_to_images,
-    view_loss,
-)
+from sceneprior.paper.fit_image import FitSchedule, decode_images, fit_latents_to_images, view_loss
 
 SHORT = FitSchedule(steps=12, drop_at=8, patience=0)
 

@@ -60,10 +60,7 @@ def test_a_step_is_torchs_encoder_and_decoder_layer_their_norms_and_the_steps_ml
             (encoder.self_attn.in_proj_bias, model.encoder_qkv.bias),
             (decoder.self_attn.in_proj_weight[2 * width :], own.value.weight),
             (decoder.self_attn.in_proj_bias[2 * width :], own.value.bias),
-            (
-                decoder.multihead_attn.in_proj_weight,
-                torch.cat([query.weight, key, value.weight]),
-            ),
+            (decoder.multihead_attn.in_proj_weight, torch.cat([query.weight, key, value.weight])),
             (
                 decoder.multihead_attn.in_proj_bias,
                 torch.cat([query.bias, torch.ones(width).double(), value.bias]),

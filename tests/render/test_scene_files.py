@@ -170,10 +170,7 @@ def test_bad_folders_and_files_say_what_to_do(scene, tmp_path):
     [
         ({"center_m": [0.0, float("nan"), 0.0]}, r"a desk has centre \[0\.0, nan, 0\.0\]"),
         ({"size_m": [1.0, -1.0, 1.0]}, "sizes above 0"),
-        (
-            {"size_m": [180.0, 50, 200]},
-            r"is above 20 m long.* Are these centimetres\?",
-        ),
+        ({"size_m": [180.0, 50, 200]}, r"is above 20 m long.* Are these centimetres\?"),
         ({"size_m": [1800, 500, 2000]}, r"Are these millimetres\? Give metres\."),
         ({"center_m": [150.0, 25, 60]}, r"100 m from the floor's centre\. Are these centimetres"),
         ({"center_m": ["0", "1", "2"]}, r"objects\.0\.center_m\.0 is .0.; input should be a valid"),

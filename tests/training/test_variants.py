@@ -33,10 +33,7 @@ RELEASED = {
     "model__completeness_target": "stop",
 }
 VARIANTS = {
-    "c1_uniform": {
-        "model__latent_space": {"name": "cube"},
-        "layout__latent_noise": 0.1,
-    },
+    "c1_uniform": {"model__latent_space": {"name": "cube"}, "layout__latent_noise": 0.1},
     "c2_lstm": {"model__decoder": {"name": "lstm"}},
     "c3_one_stage": {"layout": None, "shape__epochs": 5},
     "beveled_box": {

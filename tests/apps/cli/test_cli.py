@@ -99,6 +99,13 @@ def test_options_that_lightning_refuses_are_a_sentence_and_leave_nothing(
     assert not (tmp_path / "new").exists()
 
 
+def refuse(number: int):
+    def refused(*_):
+        raise OSError(number, os.strerror(number))
+
+    return refused
+
+
 @pytest.mark.parametrize(
     ("number", "advice"),
     [
@@ -109,27 +116,31 @@ def test_options_that_lightning_refuses_are_a_sentence_and_leave_nothing(
         (errno.EMFILE, "(Too many open files); allow more open files with `ulimit -n 4096`."),
     ],
 )
-def test_what_the_system_refuses_is_a_sentence(command, toy_run, monkeypatch, number, advice):
-    def refuse(*_):
-        raise OSError(number, os.strerror(number))
-
-    monkeypatch.setattr(files.os, "fsync", refuse)
-    for words in (
-        ("make-homes", "homes", "--rooms", 2),
-        ("synthesize", "--run", toy_run, "-n", 1, "--out", "rooms"),
-        ("pack", toy_run, "--out", "a.prior"),
-        ("eval-fid", "--run", toy_run, "-n", 2, "--out", "scores.json"),
-        ("report", "--run", toy_run, "--out", "report.html"),
-    ):
-        if words[0] == "make-homes":
-            monkeypatch.setattr("data_prep.homes.make._write_split", refuse)
-        said = one_sentence(command(*words))
-        target = words[1] if words[0] == "make-homes" else words[-1]
-        assert f"{target} cannot be read or written {advice}" in said
-        assert not list(Path().iterdir())
-    monkeypatch.setattr("sceneprior.apps.config.load_config", refuse)
+def test_what_the_system_refuses_is_a_sentence(command, monkeypatch, number, advice):
+    monkeypatch.setattr("sceneprior.apps.config.load_config", refuse(number))
     said = one_sentence(command("fit", "--config", "demo.yaml"))
     assert f"A file cannot be read or written {advice}" in said
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("make-homes", "--rooms", 2),
+        ("synthesize", "-n", 1, "--out"),
+        ("pack", "--out"),
+        ("eval-fid", "-n", 2, "--resamples", 0, "--out"),
+        ("report", "--out"),
+    ],
+    ids=lambda words: words[0],
+)
+def test_what_a_command_could_not_write_is_named(command, toy_run, monkeypatch, words):
+    name, *more = words
+    monkeypatch.setattr(files.os, "fsync", refuse(errno.ENOSPC))
+    monkeypatch.setattr("data_prep.homes.make._write_split", refuse(errno.ENOSPC))
+    run = {"make-homes": [], "pack": [toy_run]}.get(name, ["--run", toy_run])
+    said = one_sentence(command(name, *run, *more, "target"))
+    assert "target cannot be read or written (No space left on device); make room" in said
+    assert not list(Path().iterdir())
 
 
 def test_a_folder_is_no_file_for_results(command, toy_run, tmp_path):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from cli_helpers import one_sentence
+from toy_metrics import without_classifiers
 
 from sceneprior.apps.config import load_any_run
 from sceneprior.apps.priors.where import shipped_priors
@@ -26,7 +27,10 @@ def packed(command, sampler_run, tmp_path):
     return tmp_path / "mine.prior"
 
 
-def test_scores_of_a_packed_prior_need_a_file_and_shards(command, packed, toy_shards, tmp_path):
+def test_scores_of_a_packed_prior_need_a_file_and_shards(
+    command, packed, toy_shards, tmp_path, monkeypatch, few_attempts
+):
+    without_classifiers(monkeypatch)
     assert "mine.prior is not a folder that scores.json could go to" in one_sentence(
         command("eval-fid", "--run", "mine.prior", "-n", 3)
     )

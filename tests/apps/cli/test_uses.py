@@ -80,7 +80,8 @@ def test_retrieve(command, rooms, tmp_path):
     assert "cache holds no scene JSON" in said and not (tmp_path / "new").exists()
 
 
-def test_complete(command, toy_run, rooms, tmp_path):
+def test_complete(command, toy_run, rooms, tmp_path, monkeypatch):
+    monkeypatch.setattr("sceneprior.lifted.complete.RESTARTS", 1)
     scene = json.loads((rooms / "seed0_0001.json").read_text())
     scene["objects"] = scene["objects"][:1]
     given = tmp_path / "given.json"
@@ -103,7 +104,7 @@ def test_complete(command, toy_run, rooms, tmp_path):
     assert not (tmp_path / "many").exists()
 
 
-def test_a_sampler_s_rooms_have_no_latents(command, sampler_run, tmp_path):
+def test_a_sampler_s_rooms_have_no_latents(command, sampler_run, tmp_path, few_attempts):
     call = ["synthesize", "--run", sampler_run, "-n", 2]
     assert command(*call, "--out", "drawn")[0] == 0
     assert command(*call, "--out", "decoded", "--distribution", "paper")[0] == 0
@@ -112,7 +113,7 @@ def test_a_sampler_s_rooms_have_no_latents(command, sampler_run, tmp_path):
     assert (tmp_path / "drawn" / "seed0_0001.json").exists()
 
 
-def test_complete_adds_what_is_asked_for(command, sampler_run, tmp_path):
+def test_complete_adds_what_is_asked_for(command, sampler_run, tmp_path, few_attempts):
     empty = {
         "format": "sceneprior-scene", "version": 1, "name": "mine", "objects": [],
         "label_set": "front3d_bedroom", "floor_m": [[-2, -2], [2, -2], [2, 2], [-2, 2]],

@@ -8,21 +8,13 @@ from pathlib import Path
 
 import pytest
 import yaml
+from cli_helpers import call_here
 from tiny_runs import tiny_baseline_settings, write_tiny_config
+from toy_metrics import without_classifiers
 
 from sceneprior.apps.config import load_any_run, load_config
-from sceneprior.apps.experiments.compare import (
-    Compared,
-    CompareOptions,
-    compare,
-    scoring_steps,
-)
-from sceneprior.apps.experiments.comparison import (
-    load_comparison,
-    part_of,
-    runs_of,
-    variants_of,
-)
+from sceneprior.apps.experiments.compare import Compared, CompareOptions, compare, scoring_steps
+from sceneprior.apps.experiments.comparison import load_comparison, part_of, runs_of, variants_of
 from sceneprior.apps.experiments.rows import costs_of
 from sceneprior.apps.experiments.steps import StepRunner
 from sceneprior.core.errors import InputError
@@ -150,10 +142,14 @@ def test_what_is_wrong_with_a_comparison_is_said_before_anything_runs(written, c
 
 @pytest.fixture(scope="module")
 def trained(toy_shards, tmp_path_factory) -> Path:
-    """`ours` of the comparison below, trained and judged by real commands."""
+    """`ours` of the comparison below, trained and judged."""
     folder = tmp_path_factory.mktemp("compared")
     comparison = load_comparison(write_comparison(folder, toy_shards))
-    done = compare(comparison, part_of(comparison, "ours", None, None), folder / "out", SOFTWARE)
+    part = part_of(comparison, "ours", None, None)
+    with pytest.MonkeyPatch.context() as patch:
+        without_classifiers(patch)
+        patch.setattr(StepRunner, "call", call_here)
+        done = compare(comparison, part, folder / "out", SOFTWARE)
     assert done == Compared(folder / "out" / "table.md", [], [])
     return folder
 
@@ -312,7 +308,8 @@ def test_the_large_comparison_loads_and_says_where_rooms_come_from():
     assert origins["atiss"] == [None]
 
 
-def test_scenes_that_are_there_are_a_row_beside_ours(begun, toy_shards, scenes):
+def test_scenes_that_are_there_are_a_row_beside_ours(begun, toy_shards, scenes, monkeypatch):
+    monkeypatch.setattr(StepRunner, "call", call_here)
     scenes = shutil.copytree(scenes, begun / "given", ignore=shutil.ignore_patterns("scores.json"))
     given = {"title": "Theirs", "scenes": {"toy": str(scenes)}}
     methods = {"ours": {}, "theirs": given}

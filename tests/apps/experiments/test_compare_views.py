@@ -8,6 +8,7 @@ from pathlib import Path
 import h5py
 import pytest
 import yaml
+from cli_helpers import call_here
 from tiny_runs import tiny_baseline_settings, write_tiny_config
 from typer.testing import CliRunner
 
@@ -15,8 +16,10 @@ from sceneprior.apps.cli.commands import app
 from sceneprior.apps.experiments.compare import CompareOptions, compare, scoring_steps
 from sceneprior.apps.experiments.comparison import load_comparison, runs_of
 from sceneprior.apps.experiments.rows import rows_of
+from sceneprior.apps.experiments.steps import StepRunner
 from sceneprior.apps.experiments.table import VIEWS, Row, markdown
 from sceneprior.core.errors import ConfigError, InputError
+from sceneprior.paper.fit_image import SCHEDULES, FitSchedule
 
 SOFTWARE = CompareOptions()
 
@@ -34,10 +37,7 @@ def write_comparison(folder: Path, shards: Path, **changes) -> str:
         "views": 2,
         "cad_models": "shards",
         "rooms": {"toy": {"title": "Toys", "config": str(folder / "tiny.yaml")}},
-        "methods": {
-            "usl": {"title": "USL", "config": str(folder / "usl.yaml")},
-            "ours": {},
-        },
+        "methods": {"usl": {"title": "USL", "config": str(folder / "usl.yaml")}, "ours": {}},
     }
     (folder / "compare.yaml").write_text(yaml.safe_dump(data | changes, sort_keys=False))
     return str(folder / "compare.yaml")
@@ -45,6 +45,7 @@ def write_comparison(folder: Path, shards: Path, **changes) -> str:
 
 def test_methods_are_trained_scored_and_tabulated(toy_shards, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(StepRunner, "call", call_here)
     path, out = write_comparison(tmp_path, toy_shards), tmp_path / "out"
     words = ["compare", "--config", path, "--out", str(out)]
     words += ["--methods", "usl"]  # a network that answers in one pass: ours has its own tests
@@ -90,7 +91,10 @@ def numbers(cell: str) -> list[float]:
     return [float(number) for number in re.findall(r"[0-9.]+", cell)]
 
 
-def test_a_run_that_remembers_rooms_has_a_row_for_each_fit(toy_shards, toy_run, tmp_path):
+def test_a_run_that_remembers_rooms_has_a_row_for_each_fit(
+    toy_shards, toy_run, tmp_path, monkeypatch
+):
+    monkeypatch.setitem(SCHEDULES, "paper", FitSchedule(steps=6, drop_at=3))
     path = write_comparison(tmp_path, toy_shards, fits=["paper", "objects"], cad_models=None)
     comparison = load_comparison(path)
     usl, ours = runs_of(comparison, tmp_path / "out")

@@ -1,4 +1,4 @@
-"""Scores of made-up runs: what stands in which cell of the tables."""
+"""Scores of made-up runs: what stands in which cell of the tables, and who made a row."""
 
 import csv
 import io
@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from sceneprior.apps.experiments.makers import LIFTED, PAPER
+from sceneprior.apps.config import load_config
+from sceneprior.apps.experiments.makers import LIFTED, PAPER, maker_of_answers, maker_of_rooms
 from sceneprior.apps.experiments.table import NEW_ROOMS, Row, as_csv, markdown
 
 PROTOCOL = {"n_generated": 200, "n_test": 38, "n_train_rooms": 149, "shards": "front"}
@@ -98,3 +99,42 @@ def test_a_table_first_says_which_rows_are_the_papers_method_and_which_ours(rows
         line["made by"] for line in csv.DictReader(io.StringIO(as_csv([sampled], NEW_ROOMS)))
     ]
     assert made_by == ["the lifted method"]
+
+
+@pytest.mark.parametrize(
+    ("name", "distribution", "title", "said"),
+    [
+        ("bedroom", None, "Paper's method", PAPER.said),
+        ("paper/bedroom_small", "kernel", "Paper's method", PAPER.said),
+        (
+            "lifted/bedroom",
+            "paper",
+            "Paper's sphere, trained on lifted boxes",
+            "the paper's network and latents trained on lifted boxes",
+        ),
+        ("lifted/living", "sampler", "Lifted method: sampler", LIFTED),
+        ("baselines/gan", None, "", "baselines"),
+    ],
+)
+def test_a_config_and_a_distribution_say_what_makes_rooms(name, distribution, title, said):
+    maker = maker_of_rooms(load_config(f"{name}.yaml"), distribution)
+    assert (maker.title, maker.said) == (title, said)
+
+
+@pytest.mark.parametrize(
+    ("name", "fit", "title", "said"),
+    [
+        ("lifted/bedroom_small", "objects", "Object by object", LIFTED),
+        ("paper/bedroom_small", "objects", "Object by object, by the paper's prior", LIFTED),
+        ("paper/bedroom_small", "paper", "Paper: fit of a latent", PAPER.said),
+        (
+            "lifted/bedroom_small",
+            "paper",
+            "Fit of a latent, trained on lifted boxes",
+            "the paper's network and latents trained on lifted boxes",
+        ),
+    ],
+)
+def test_a_config_and_a_fit_say_what_answers_images(name, fit, title, said):
+    maker = maker_of_answers(load_config(f"{name}.yaml"), fit)
+    assert (maker.title, maker.said) == (title, said)

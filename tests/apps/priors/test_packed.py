@@ -30,6 +30,7 @@ from sceneprior.lifted.complete import complete
 from sceneprior.paper.interpolate import interpolate
 from sceneprior.training.fit import fit
 
+pytestmark = pytest.mark.usefixtures("few_attempts")
 BED = SceneObject("double_bed", (0.2, 0.3, -0.9), (1.7, 0.6, 2.1))
 CONFIGS = sorted(
     path

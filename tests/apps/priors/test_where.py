@@ -25,7 +25,7 @@ def hub(tmp_path, monkeypatch):
     return tmp_path / "cache"
 
 
-def test_a_repository_of_the_hub_is_a_prior(hub, sampler_run, tmp_path):
+def test_a_repository_of_the_hub_is_a_prior(hub, sampler_run, tmp_path, few_attempts):
     """The repository is stored as the Hub's own client does: by commit, with the name of the
     branch."""
     trained = load_any_run(sampler_run)

@@ -17,12 +17,7 @@ from sceneprior.apps.reconstruction.reconstruct import (
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.observed_image import as_views, images_of_split, rows_of
-from sceneprior.paper.fit_image import (
-    SCHEDULES,
-    FitSchedule,
-    decode_images,
-    view_loss,
-)
+from sceneprior.paper.fit_image import SCHEDULES, FitSchedule, decode_images, view_loss
 
 
 @pytest.fixture(scope="module")

@@ -88,7 +88,8 @@ def test_sampled_rooms_get_models_in_their_boxes(prior):
     assert scene_to_json(made) == scene_to_json(again)
 
 
-def test_a_completed_room_keeps_what_was_given(prior):
+def test_a_completed_room_keeps_what_was_given():
+    prior = sceneprior.load("procthor-bedroom")
     box = (0.0, 0.3, -1.0), (1.8, 0.6, 2.0)
     bed = SceneObject("double_bed", *box, box_mesh(*box))
     given = Scene("mine", "front3d_bedroom", (bed,))

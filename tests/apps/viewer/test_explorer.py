@@ -90,7 +90,8 @@ def test_a_path_s_end_is_no_file_of_this_machine(explorer, prior, tmp_path):
             explorer.draw_path(explorer.sample(3), "here", text)
 
 
-def test_completion_keeps_what_is_kept(explorer):
+def test_completion_keeps_what_is_kept(explorer, monkeypatch):
+    monkeypatch.setattr("sceneprior.lifted.complete.RESTARTS", 1)
     shown = explorer.sample(1).toggled(1)
     kept = shown.scene.objects[1]
     assert shown.toggled(1).kept == frozenset() and shown.given().objects == (kept,)

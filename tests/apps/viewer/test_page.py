@@ -1,4 +1,4 @@
-"""The panel shows names out of files as they are: no HTML, no Markdown, no file of this machine."""
+"""The panel shows names out of files as they are, answers requests, and offers furniture."""
 
 import numpy as np
 import pytest
@@ -11,6 +11,7 @@ from sceneprior.core.scene import Scene, SceneObject
 pytest.importorskip("viser", reason="the extra `view` is not installed")
 
 from sceneprior.apps.viewer.page import Page
+from sceneprior.apps.viewer.panel import DECODED, MODELS
 from sceneprior.apps.viewer.server import serving
 from sceneprior.apps.viewer.words import error_words, html, wish_words
 
@@ -124,3 +125,21 @@ def test_the_drawing_fills_the_fields_and_follows_them(prior):
         fields._draw_or_end()
         assert fields.floor.value == "-2.25,-1.75 1.75,-1.75 2.25,1.75 -2.25,1.25"
         assert page._room.frame.visible and drawing.plan is None
+
+
+pytest.importorskip("viser", reason="the extra `view` is not installed")
+
+
+def test_models_come_and_go():
+    bed = SceneObject("double_bed", (0.0, 0.5, 0.0), (2.0, 1.0, 2.2))
+    with serving("127.0.0.1", 0) as server:
+        page = Page(server, Folder([Scene("room", "front3d_bedroom", (bed,))]), "rooms")
+        assert page.scene.objects == (bed,)
+        page.panel.furniture.value = MODELS
+        page.show(page.shown)
+        (found,) = page.scene.extra["retrieval"]
+        assert found["model_id"].startswith("double_bed_")
+        assert page.scene.objects[0].mesh is not None
+        page.panel.furniture.value = DECODED
+        page.show(page.shown)
+        assert page.scene.objects == (bed,)

@@ -1,6 +1,7 @@
 """The set flow: sets in, velocities out, rooms sampled, and a training that fits a few rooms."""
 
 import math
+from itertools import permutations
 
 import pytest
 import torch
@@ -8,6 +9,7 @@ from tiny_runs import tiny_baseline
 from torch.testing import assert_close
 
 from sceneprior.baselines.set_flow.network import NUMBERS, SetFlow, SetFlowModel
+from sceneprior.baselines.set_flow.stage import matched
 from sceneprior.baselines.true_boxes import TruthDataset
 from sceneprior.core.views import RoomBoxes
 from sceneprior.training.steps import with_cosine
@@ -165,3 +167,18 @@ def test_a_set_flow_learns_rooms_by_heart(toy_shards):
     holds = [sorted(labels[labels > 0].tolist()) for labels in known.object_class]
     drawn = [sorted(labels[labels > 0].tolist()) for labels in found.object_class]
     assert sum(room in holds for room in drawn) > 30
+
+
+def test_noise_goes_the_shortest_way_to_the_objects(torch_rng):
+    noise = torch.randn(3, 4, 5, generator=torch_rng)
+    tokens = torch.randn(3, 4, 5, generator=torch_rng)
+    counts = [4, 2, 0]
+    is_object = torch.arange(4) < torch.tensor(counts)[:, None]
+    found = matched(noise, tokens, is_object)
+    for room, count in enumerate(counts):
+        ways = {
+            order: float(((noise[room, list(order)] - tokens[room, :count]) ** 2).sum())
+            for order in permutations(range(count))
+        }
+        best = min(ways, key=ways.get)
+        assert torch.equal(found[room, :count], noise[room, list(best)])

@@ -6,11 +6,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from sceneprior.baselines.single_view.detections import (
-    CROP,
-    detections_of,
-    some_views,
-)
+from sceneprior.baselines.single_view.detections import CROP, detections_of, some_views
 from sceneprior.core.data.dataset import ViewDataset
 from sceneprior.core.geometry.turns import turn_vectors
 from sceneprior.core.views import SceneViews

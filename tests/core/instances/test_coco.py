@@ -101,10 +101,7 @@ def test_what_is_small_is_in_front_and_crowds_are_no_object(read):
 @pytest.mark.parametrize(
     ("data", "said"),
     [
-        (
-            [],
-            "a.json is a list of results, not a COCO JSON of masks; expected an object with",
-        ),
+        ([], "a.json is a list of results, not a COCO JSON of masks; expected an object with"),
         ([{"image_id": 1, "category_id": 1, "segmentation": []}], "add the other two."),
         (3, "a.json is 3, not a COCO JSON of masks"),
         ({"images": []}, "not a COCO JSON of masks: annotations is {'images': []}; field required"),
@@ -123,10 +120,7 @@ def test_what_is_small_is_in_front_and_crowds_are_no_object(read):
         (image(0, 40), "images.0.height is 0; input should be greater than or equal to 1."),
         (image(10**400, 40), "pixels, more than 67 million; write the masks of a smaller image"),
         (coco([{"counts": [1200]}]), "annotation 70: its segmentation has no 'size'."),
-        (
-            coco([{"size": [30], "counts": [30]}]),
-            "its mask has [30] pixels, but the image has",
-        ),
+        (coco([{"size": [30], "counts": [30]}]), "its mask has [30] pixels, but the image has"),
         (coco([{"size": [30, 40], "counts": [10**30]}]), "its runs cover too many pixels, not"),
         (
             coco([{"size": [30, 40], "counts": "o" * 9_999}]),

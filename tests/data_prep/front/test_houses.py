@@ -90,16 +90,6 @@ def test_placements_that_are_no_numbers_are_named(front, key, value, note):
     assert "'bed' is left out" in room_.notes[0] and note in room_.notes[0]
 
 
-def test_wild_scales_leave_the_room_out(front):
-    written = room("A", [{"jid": "bed", "pos": (0, 0, 0), "scale": [1, 6, 1]}])
-    path = front.house("house", written)
-    result = read(front, path)
-    assert not result.rooms
-    why = "'bed' is scaled by 1, 6, 1, beyond scale_range"
-    assert result.filtered == [("house_A", "scale_range", why)]
-    assert len(read(front, path, rules=("scale_range=null",)).rooms) == 1
-
-
 def test_a_scale_of_zero_is_never_drawn(front):
     pieces = [
         {"jid": "bed", "pos": (0, 0, 0)},

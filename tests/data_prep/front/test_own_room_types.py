@@ -10,6 +10,7 @@ import yaml
 from front_files import FrontFolder, room
 from front_jobs import rooms_of
 from pages import ROOT, first_block, run_first_commands
+from toy_metrics import without_classifiers
 
 from data_prep.engine.build import Job, build_shards
 from data_prep.engine.report_tables import report_tables
@@ -121,6 +122,7 @@ def test_the_models_of_shards_have_the_classes_of_their_recipe(tmp_path):
 
 @pytest.mark.slow
 def test_the_page_runs_as_printed(tmp_path, monkeypatch):
+    without_classifiers(monkeypatch)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     write_kitchens(tmp_path / "kitchens")

@@ -1,4 +1,4 @@
-"""3D-FRONT as a source: room types, rules and views of a house, and what its numbers promise."""
+"""3D-FRONT as a source: room types and views of a house, and what its numbers promise."""
 
 import json
 from collections import defaultdict
@@ -79,37 +79,6 @@ def test_a_type_that_no_room_has(front):
     flat(front)
     with pytest.raises(InputError, match=r"selects \(attic\); the folder has .*LivingRoom \(1\)"):
         survey(front, "bedroom", "room_types=[attic]")
-
-
-@pytest.mark.parametrize(
-    ("change", "rule", "why"),
-    [
-        ({"pieces": 1}, "min_objects", "1 objects, min_objects is 2"),
-        ({"pieces": 14}, "max_objects", "14 objects, max_objects is 13"),
-        ({"bounds": (-3.1, -2, 3.1, 2)}, "max_floor_m", "floor 6.20 x 4.00 m, max_floor_m is 6"),
-        ({"wall_m": 4.2}, "max_height_m", "height 4.20 m, max_height_m is 4"),
-        (
-            {"jid": "stand"},
-            "required_classes",
-            "none of double_bed, single_bed, kids_bed, of which",
-        ),
-        ({"scale": [9, 1, 1]}, "scale_range", "'bed' is scaled by 9, 1, 1, beyond scale_range"),
-    ],
-)
-def test_each_rule_leaves_a_room_out_by_name_and_can_be_switched_off(front, change, rule, why):
-    count = change.get("pieces", 2)
-    bed = {"jid": change.get("jid", "bed"), "pos": (0, 0, 0), "scale": change.get("scale", [1] * 3)}
-    pieces = [bed] + [{"jid": "stand", "pos": (0.1 * k, 0, 1)} for k in range(1, count)]
-    written = room("A", pieces, bounds=change.get("bounds", (-2, -2, 2, 2)))
-    wall = written["_meshes"][1]["xyz"]
-    wall[7] = wall[10] = change.get("wall_m", 2.6)
-    front.house("house", written, bedroom("B"), bedroom("C"))
-    found = survey(front, "bedroom")
-    (item,) = found.left_out
-    assert (item.room_id, item.rule, item.status) == ("house_A", rule, "filtered")
-    assert item.reason.startswith(why)
-    off = f"{rule}=[]" if rule == "required_classes" else f"{rule}=null"
-    assert not survey(front, "bedroom", off).left_out
 
 
 def test_the_views_of_a_house(front):

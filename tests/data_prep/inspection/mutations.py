@@ -87,11 +87,6 @@ def scaled(factor):
     return change
 
 
-def transposed(poses):
-    poses[:, :3, :3] = poses[:, :3, :3].transpose(0, 2, 1).copy()
-    return poses
-
-
 def swapped(poses):
     poses[[1, 2]] = poses[[2, 1]]
     return poses
@@ -105,8 +100,3 @@ def longer(factor):
         return lenses
 
     return change
-
-
-def of_another_size(lenses):
-    lenses[:, :2] *= 2.7  # 1296 x 968 instead of 480 x 360, say
-    return lenses

@@ -1,13 +1,12 @@
 """Ground truth against masks: right rooms agree, each kind of wrong one does not."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from front_files import bedroom
-from front_jobs import front_job, rooms_of
+from front_jobs import bedroom_shards, rooms_of
 
-from data_prep.engine.build import build_shards
 from data_prep.inspection.agreement import MARGIN, Agreement, Tally, compare, compare_boxes
 from data_prep.inspection.bodies import hull_of_model, true_bodies
 from sceneprior.core.errors import ShardError
@@ -15,13 +14,12 @@ from sceneprior.core.errors import ShardError
 LARGER = ("views.image_size=[180, 240]", "views.per_m2=2")
 
 
-@pytest.fixture
-def made(front, tmp_path):
-    """(views, truth, folder of shards) of a bedroom."""
-    front.house("house", bedroom("Bedroom-0"))
-    build_shards(front_job(front, tmp_path / "shards", rules=LARGER, only="house"))
-    (pair,) = rooms_of(tmp_path / "shards").values()
-    return *pair, tmp_path / "shards"
+@pytest.fixture(scope="module")
+def made(made_once):
+    """(views, truth, folder of shards) of a bedroom. Tests only read it."""
+    folder = made_once("large_bedroom", lambda folder: bedroom_shards(folder, *LARGER))
+    (pair,) = rooms_of(folder).values()
+    return *pair, folder
 
 
 def test_whole_things_are_those_that_nothing_cuts_off(made):
@@ -70,8 +68,9 @@ def test_what_is_undefined_disagrees_and_the_margin_is_what_it_says(made):
     assert Agreement({"mesh": behind}).failing() == ["mesh"]
 
 
-def test_models_that_are_missing_or_damaged_are_named(made):
-    views, truth, shards = made
+def test_models_that_are_missing_or_damaged_are_named(made, tmp_path):
+    views, truth, _ = made
+    shards = shutil.copytree(made[2], tmp_path / "shards")
     path = shards / "models" / f"{truth.model_ids[0]}.ply"
     whole = path.read_bytes()
     hull_of_model.cache_clear()
@@ -80,7 +79,7 @@ def test_models_that_are_missing_or_damaged_are_named(made):
         with pytest.raises(ShardError, match=r"\.ply is not a triangle mesh \(\w+: "):
             hull_of_model(path)
     path.unlink()
-    bodies, problems = true_bodies(*made)
+    bodies, problems = true_bodies(views, truth, shards)
     assert None in bodies and not compare(bodies, views).judged[:, bodies.index(None)].any()
     assert ".ply is missing, but a room's ground truth refers to it" in problems[0]
 

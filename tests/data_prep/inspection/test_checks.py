@@ -4,19 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from front_files import bedroom
-from front_jobs import front_job, rooms_of
+from front_jobs import bedroom_shards, rooms_of
 
-from data_prep.engine.build import build_shards
 from data_prep.inspection.checks import array_problems, mask_problems, truth_problems
 
 
-@pytest.fixture
-def made(front, tmp_path):
+@pytest.fixture(scope="module")
+def made(made_once):
     """(views, truth) of a bedroom with a bed and two nightstands."""
-    front.house("house", bedroom("Bedroom-0"))
-    build_shards(front_job(front, tmp_path / "shards", only="house"))
-    (pair,) = rooms_of(tmp_path / "shards").values()
+    (pair,) = rooms_of(made_once("bedroom", bedroom_shards)).values()
     return pair
 
 

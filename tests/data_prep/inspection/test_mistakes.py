@@ -3,6 +3,7 @@
 The table of docs/mistakes.md has a row for each.
 """
 
+import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from captures import FLIP, Z_UP, changed, make_captures, of_ids, of_keys, of_poses, shards_of
+from mutations import scaled
 
 from data_prep.inspection.given import given_of
 from data_prep.inspection.tables import summary
@@ -38,14 +40,6 @@ def _moved(poses):
     return poses
 
 
-def _scaled(factor):
-    def change(poses):
-        poses[:, :3, 3] *= factor
-        return poses
-
-    return change
-
-
 def _sorted_as_text(poses):
     return poses[sorted(range(len(poses)), key=lambda k: str(k + 1))]
 
@@ -65,8 +59,6 @@ def _restart(ids, frame):
 
 def _unique(room, data):
     """An id of its own for each mask of each image, and its class."""
-    import json
-
     table = json.loads((room / "classes.json").read_text())
     new = {}
 
@@ -144,9 +136,9 @@ MISTAKES = {
     ),
     "y up": Mistake(of_poses(lambda poses: np.linalg.inv(Z_UP) @ poses), r"pass --up y"),
     "centimetres": Mistake(
-        of_poses(_scaled(100)), r"metres_per_unit.*--metres-per-unit 0\.01"
+        of_poses(scaled(100)), r"metres_per_unit.*--metres-per-unit 0\.01"
     ),
-    "feet": Mistake(of_poses(_scaled(1 / 0.3048)), r"in feet: pass --metres-per-unit 0\.3048"),
+    "feet": Mistake(of_poses(scaled(1 / 0.3048)), r"in feet: pass --metres-per-unit 0\.3048"),
     "focal length 0.5": Mistake(_longer(0.5), r"are about 2 times too short: multiply them by 2"),
     "focal length 0.7": Mistake(_longer(0.7), r"are about 1\.[346] times too short"),
     "focal length 1.3": Mistake(_longer(1.3), r"\(fl_x, fl_y .* about 1\.[34] times too long"),

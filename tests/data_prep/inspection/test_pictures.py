@@ -2,10 +2,8 @@
 
 import numpy as np
 import pytest
-from front_files import bedroom
-from front_jobs import front_job
+from front_jobs import bedroom_shards
 
-from data_prep.engine.build import build_shards
 from data_prep.inspection.pictures import AXES, BACKGROUND, FLOOR, WALL, draw_plan, draw_view
 from data_prep.inspection.projection import wire_pixels
 from sceneprior.core.geometry.corners import BOX_EDGES, box_corners
@@ -13,10 +11,8 @@ from sceneprior.core.shards import Shard, list_shards
 
 
 @pytest.fixture
-def shard(front, tmp_path):
-    front.house("house", bedroom("Bedroom-0"))
-    build_shards(front_job(front, tmp_path / "shards", only="house"))
-    with Shard(list_shards(tmp_path / "shards", "train")[0]) as opened:
+def shard(made_once):
+    with Shard(list_shards(made_once("bedroom", bedroom_shards), "train")[0]) as opened:
         yield opened
 
 

@@ -5,13 +5,7 @@ import pytest
 
 from data_prep.front.viewpoints import camera_pose
 from data_prep.inspection import projection
-from data_prep.inspection.projection import (
-    Hull,
-    box_iou_2d,
-    boxes_around,
-    hull_of,
-    wire_pixels,
-)
+from data_prep.inspection.projection import Hull, box_iou_2d, boxes_around, hull_of, wire_pixels
 from sceneprior.core.geometry.corners import BOX_EDGES, box_corners
 
 K = np.array([[100.0, 0, 60], [0, 100, 45], [0, 0, 1]])

@@ -1,20 +1,19 @@
 """The sheet, the counts and the command around them."""
 
+import shutil
+
 import h5py
 import pytest
-from front_jobs import front_job, three_houses
+from front_jobs import six_bedrooms_shards
 from PIL import Image
 
-from data_prep.engine.build import build_shards
 from data_prep.inspection.pictures import draw_sheet
 from sceneprior.core.errors import InputError
 
 
 @pytest.fixture
-def shards(front, tmp_path):
-    three_houses(front)
-    build_shards(front_job(front, tmp_path / "shards"))
-    return tmp_path / "shards"
+def shards(made_once, tmp_path):
+    return shutil.copytree(made_once("six_bedrooms", six_bedrooms_shards), tmp_path / "shards")
 
 
 def test_a_sheet_of_a_folder_and_of_a_room(shards):

@@ -5,22 +5,21 @@ import shutil
 import h5py
 import numpy as np
 import pytest
-from front_jobs import change_room, front_job, three_houses
+from front_jobs import change_room, six_bedrooms_shards
 from rich.console import Console
 
-from data_prep.engine.build import build_shards
 from data_prep.inspection.agreement import Agreement, Tally
 from data_prep.inspection.tables import check_tables
 from data_prep.inspection.verify import FolderCheck, RoomCheck, verify
 from sceneprior.core.errors import InputError
 
+RULES = ("views.per_m2=1.5", "views.image_size=[120, 160]")
+
 
 @pytest.fixture
-def shards(front, tmp_path):
-    three_houses(front)
-    rules = ("views.per_m2=1.5", "views.image_size=[120, 160]")
-    build_shards(front_job(front, tmp_path / "shards", rules=rules))
-    return tmp_path / "shards"
+def shards(made_once, tmp_path):
+    made = made_once("verified", lambda folder: six_bedrooms_shards(folder, *RULES))
+    return shutil.copytree(made, tmp_path / "shards")
 
 
 def test_several_workers_find_the_same(shards):

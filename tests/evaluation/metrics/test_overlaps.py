@@ -5,11 +5,7 @@ import pytest
 from toy_metrics import compared_with, of_classes, room, room_set
 
 from sceneprior.core.classes import label_set
-from sceneprior.evaluation.metrics.overlaps import (
-    METRICS,
-    plausible_pairs,
-    room_overlaps,
-)
+from sceneprior.evaluation.metrics.overlaps import METRICS, plausible_pairs, room_overlaps
 
 FUNCTIONS = {metric.key: metric.function for metric in METRICS}
 CLASSES = label_set("front3d_bedroom")

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Mesh, Opening, Scene, SceneObject, Turned
 from sceneprior.evaluation.metrics.bounds import out_of_bounds
 from sceneprior.evaluation.metrics.clearance import clearances
@@ -289,10 +288,3 @@ def test_symmetries_change_nothing():
         assert other[key] == pytest.approx(plain[key], rel=near, abs=near), key
     for order in itertools.permutations(made):
         assert measure_room(room(*order), UseOptions("none"))["sceneeval_col_objects"] == (2, 3)
-
-
-def test_an_unknown_choice_of_rooms_to_simulate_is_a_sentence():
-    with pytest.raises(
-        InputError, match="--settle some is not known; choose from solids, all, none"
-    ):
-        UseOptions("some")

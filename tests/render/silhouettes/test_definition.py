@@ -6,13 +6,7 @@ import numpy as np
 import pytest
 import torch
 from references.silhouettes import composite_loop, exact_loop
-from silhouette_scenes import (
-    COMPOSITING,
-    MODES,
-    SIZE,
-    random_scene,
-    triangles,
-)
+from silhouette_scenes import COMPOSITING, MODES, SIZE, random_scene, triangles
 from toy_rooms import look_at
 
 from sceneprior.core.geometry.cameras import project

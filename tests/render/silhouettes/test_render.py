@@ -13,11 +13,7 @@ from toy_rooms import look_at
 
 from sceneprior.core.geometry.meshes import icosphere
 from sceneprior.render.offscreen.zbuffer import rasterize
-from sceneprior.render.silhouettes.render import (
-    render_scene,
-    render_silhouettes,
-    sigma_from_ndc,
-)
+from sceneprior.render.silhouettes.render import render_scene, render_silhouettes, sigma_from_ndc
 
 
 def lumpy_room() -> dict:

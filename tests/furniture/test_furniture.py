@@ -1,11 +1,41 @@
-"""Furniture from tables of parts."""
+"""Furniture from tables of parts: solids, tables, and the sizes of the catalogue."""
+
+from statistics import median
 
 import numpy as np
 import pytest
 
 from sceneprior.core.classes import LABEL_SETS
-from sceneprior.furniture.catalog import make_catalog
+from sceneprior.furniture import solids
+from sceneprior.furniture.catalog import at_score, make_catalog, real_sizes
 from sceneprior.furniture.tables import Table, build, furniture_tables
+
+
+@pytest.mark.parametrize(
+    ("solid", "low", "high"),
+    [
+        (solids.box(1, 2, 3, 4, 5, 6), (3.5, 5, 4.5), (4.5, 7, 7.5)),
+        (solids.beveled_box(1, 2, 3, 4, 5, 6), (3.5, 5, 4.5), (4.5, 7, 7.5)),
+        (solids.cylinder(1, 2, 3, 4, 5), (2, 4, 4), (4, 6, 6)),
+        (solids.torus(1, 0.2, 3), (-1, 3, -1), (1, 3.2, 1)),
+        (solids.panel(solids.arch(2, 3, 2, steps=11), 0.5, 1), (-1, 0, 0.75), (1, 3, 1.25)),
+        (
+            solids.shifted(solids.tilted(solids.box(2, 4, 6), np.pi / 2), 1, 2, 3),
+            (0, -1, 3),
+            (2, 5, 7),
+        ),
+        (solids.scaled(solids.box(1, 1, 1), [1, 2, 3]), (-0.5, 0, -1.5), (0.5, 2, 1.5)),
+    ],
+)
+def test_solids_are_closed_and_stand_where_they_should(solid, low, high):
+    assert solid.is_watertight and solid.is_winding_consistent and solid.volume > 0
+    np.testing.assert_allclose(solid.bounds, [low, high], atol=1e-12)
+
+
+def test_fitted_parts_fill_the_size_together():
+    parts = solids.fit_to([solids.box(1, 1, 1), solids.box(1, 1, 1, x=2)], (6, 2, 1))
+    np.testing.assert_allclose(parts[0].bounds, [[-3, 0, -0.5], [-1, 2, 0.5]], atol=1e-12)
+    np.testing.assert_allclose(parts[1].bounds, [[1, 0, -0.5], [3, 2, 0.5]], atol=1e-12)
 
 
 def build_from(tables: dict, size_m=(1.0, 2.0, 0.5), style: int = 0):
@@ -84,3 +114,15 @@ def test_a_table_repeats_names_values_and_picks_a_style():
 def test_a_row_that_cannot_be_worked_out_is_named(tables, said):
     with pytest.raises(ValueError, match=f"Furniture {said}"):
         build_from(tables)
+
+
+def test_sizes_keep_to_the_real_percentiles():
+    for name, models in make_catalog(0, "front3d_bedroom").items():
+        for axis, (low, middle, high) in enumerate(real_sizes()[name]):
+            sizes = [model.size_m[axis] for model in models]
+            # An even dozen has no model at the median itself: the middle two straddle it.
+            assert median(sizes) == pytest.approx(middle, rel=0.15), (name, axis)
+            assert low < median(sizes) < high
+            assert sum(low <= size <= high for size in sizes) >= 10
+    at_ends = [at_score(1.0, 2.0, 6.0, score) for score in (-1.2816, 0.0, 1.2816)]
+    assert at_ends == pytest.approx([1, 2, 6])
