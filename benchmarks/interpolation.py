@@ -38,7 +38,7 @@ from sceneprior.paper.trained import TrainedPrior
 JUMP = 3.0
 """A jump is a step above this many medians."""
 PLACES = (0.0, 0.125, 0.25, 0.375, 0.5)
-POINTS = 100
+POINTS = 50
 """Points of a mesh whose distances to the other mesh's triangles are averaged."""
 
 
@@ -121,8 +121,13 @@ def moves(paths: Sequence[RoomPath], steps: int) -> dict[str, Any]:
 
 
 def changes(paths: Sequence[RoomPath], steps: int) -> dict[str, Any]:
-    """Jumps of shapes per step, as decoded and as blended, and how far the two are apart."""
-    sizes: dict[str, list[np.ndarray]] = {"decoded": [], "blended": []}
+    """Changes of shape per step, as decoded and as blended, and how far the two are apart.
+
+    `jumps` and `median_cm` are of meshes in the room, whose boxes move; `alone_99%_cm` is of shapes
+    alone, with both meshes in one box.
+    """
+    moved: dict[str, list[np.ndarray]] = {"decoded": [], "blended": []}
+    alone: dict[str, list[float]] = {"decoded": [], "blended": []}
     apart = []
     for path in paths:
         places, names = even_places(steps), [""] * steps
@@ -134,18 +139,20 @@ def changes(paths: Sequence[RoomPath], steps: int) -> dict[str, Any]:
             tracks: dict[int, list[float]] = {}
             for before, after in pairwise(way):
                 for slot in set(before.predictions) & set(after.predictions):
-                    change = chamfer_m(item_of(before, slot).mesh, item_of(after, slot).mesh)
-                    tracks.setdefault(slot, []).append(change)
-            sizes[name] += map(np.array, tracks.values())
-        for one, other in zip(*rooms.values(), strict=True):
-            pairs = zip(one.scene.objects, other.scene.objects, strict=True)
-            apart += [chamfer_m(here.mesh, there.mesh) for here, there in pairs]
+                    one, other = item_of(before, slot), item_of(after, slot)
+                    tracks.setdefault(slot, []).append(chamfer_m(one, other))
+                    here = other.in_box(one.center_m, one.size_m)
+                    alone[name].append(chamfer_m(one, here))
+            moved[name] += map(np.array, tracks.values())
+        for decoded, blended in zip(*rooms.values(), strict=True):
+            pairs = zip(decoded.scene.objects, blended.scene.objects, strict=True)
+            apart += [chamfer_m(one, other) for one, other in pairs]
     told: dict[str, Any] = {}
-    for name, tracks in sizes.items():
-        every = np.concatenate(tracks)
+    for name, tracks in moved.items():
         jumps = np.concatenate([track > JUMP * np.median(track) for track in tracks])
-        told |= {f"{name}_jumps": float(jumps.mean())}
-        told |= {f"{name}_{q}%_cm": 100 * float(np.quantile(every, q / 100)) for q in (50, 95, 99)}
+        told[f"{name}_jumps"] = float(jumps.mean())
+        told[f"{name}_median_cm"] = 100 * float(np.median(np.concatenate(tracks)))
+        told[f"{name}_alone_99%_cm"] = 100 * float(np.quantile(alone[name], 0.99))
     return {**told, "blended_from_decoded_cm": 100 * float(np.mean(apart))}
 
 
@@ -154,11 +161,14 @@ def item_of(room: DecodedRoom, slot: int) -> SceneObject:
     return room.scene.objects[room.predictions.index(slot)]
 
 
-def chamfer_m(a: Mesh | None, b: Mesh | None) -> float:
+def chamfer_m(one: SceneObject, other: SceneObject) -> float:
     """Chamfer distance (both ways added) from points of each mesh to the other's triangles, so that
     it is 0 for equal meshes."""
+    a, b = one.mesh, other.mesh
     assert a is not None and b is not None, "the runs have shapes"
-    return chamfer_of(*(apart_m(*pair) for pair in ((a, b), (b, a)))).l2_m
+    if a.vertices_m.shape == b.vertices_m.shape and np.allclose(a.vertices_m, b.vertices_m):
+        return 0.0
+    return chamfer_of(apart_m(a, b), apart_m(b, a)).l2_m
 
 
 def apart_m(a: Mesh, b: Mesh) -> np.ndarray:

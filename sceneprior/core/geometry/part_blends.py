@@ -6,6 +6,10 @@ from jaxtyping import Float
 
 from sceneprior.core.parts import BOX, SQUARE, Parts
 
+SLIVER = 1e-3
+"""Steps, as a share of the box, in which the sides of blended solids move. A mesh would have faces
+without area where one side is ahead of another by less than parts overlap (`part_meshes.OVERLAP`).
+"""
 OTHER_KIND = 1e3
 """Cost of a pair of two kinds, which exceeds that of all other pairs together."""
 DECIMALS = 6
@@ -15,15 +19,24 @@ DECIMALS = 6
 def blend_parts(a: Parts, b: Parts, share: float) -> Parts:
     """The object between two matched ones (`matched_parts`) that has `share` of `b`, from 0 to 1.
 
-    The shares 0 and 1 give `a` and `b`.
+    The shares 0 and 1 give `a` and `b`. All solids together reach as far as the share demands.
     """
     if share in (0, 1):
         return b if share else a
-    ends, outline = (
-        (1 - share) * here + share * there
-        for here, there in ((a.ends, b.ends), (a.outline, b.outline))
-    )
-    return Parts(a.kind, a.mirrored, ends, outline)
+
+    def between(here: np.ndarray, there: np.ndarray) -> np.ndarray:
+        return np.asarray((1 - share) * here + share * there)
+
+    ends = between(a.ends, b.ends)
+    (low, high), (new_low, new_high) = _bounds(ends), between(_bounds(a.ends), _bounds(b.ends))
+    scale = (new_high - new_low) / np.maximum(high - low, SLIVER)
+    placed = (ends - low[:, None]) * scale[:, None] + new_low[:, None]
+    steps = (placed / SLIVER).round() * SLIVER
+    return Parts(a.kind, a.mirrored, steps, between(a.outline, b.outline))
+
+
+def _bounds(ends: Float[np.ndarray, "solids 3 2"]) -> Float[np.ndarray, "2 3"]:
+    return np.stack([ends[..., 0].min(axis=0), ends[..., 1].max(axis=0)])
 
 
 def matched_parts(a: Parts, b: Parts) -> tuple[Parts, Parts]:
