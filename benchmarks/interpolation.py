@@ -28,6 +28,7 @@ from rooms_needed import relations, scenes_of
 
 import sceneprior
 from sceneprior.core.geometry.surfaces import chamfer_of, surface_points
+from sceneprior.core.ground_truth import known_in_3d
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.evaluation.metrics.overlaps import plausible_pairs, room_overlaps
 from sceneprior.paper.decode import DecodedRoom, decode_rooms
@@ -54,7 +55,13 @@ def main() -> None:
     torch.set_num_threads(1)
     trained, seed = sceneprior.load(arguments.run).with_latents, arguments.seed
     shards = arguments.shards or Path(trained.config.data.shards)
-    real, test = scenes_of(shards, "train") + scenes_of(shards, "val"), scenes_of(shards, "test")
+    real = [
+        room
+        for split in ("train", "val")
+        if known_in_3d(shards, split)
+        for room in scenes_of(shards, split)
+    ]
+    test = scenes_of(shards, "test")
     few = np.random.default_rng(seed).permutation(len(real))[: arguments.paths]
     for name, rooms in (("real training", [real[k] for k in few]), ("real test", test)):
         tell(rooms=name, **judged(rooms, real, test))
