@@ -155,10 +155,10 @@ def changes(paths: Sequence[RoomPath], steps: int) -> dict[str, Any]:
             pairs = zip(decoded.scene.objects, blended.scene.objects, strict=True)
             apart += [chamfer_m(one, other) for one, other in pairs]
     told: dict[str, Any] = {}
-    for name, tracks in moved.items():
-        jumps = np.concatenate([track > JUMP * np.median(track) for track in tracks])
+    for name, sizes in moved.items():
+        jumps = np.concatenate([size > JUMP * np.median(size) for size in sizes])
         told[f"{name}_jumps"] = float(jumps.mean())
-        told[f"{name}_median_cm"] = 100 * float(np.median(np.concatenate(tracks)))
+        told[f"{name}_median_cm"] = 100 * float(np.median(np.concatenate(sizes)))
         told[f"{name}_alone_99%_cm"] = 100 * float(np.quantile(alone[name], 0.99))
     return {**told, "blended_from_decoded_cm": 100 * float(np.mean(apart))}
 

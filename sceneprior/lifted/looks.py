@@ -217,11 +217,11 @@ class LookDecoder(ShapeModule):
         own = [posed_parts(self.parts(look // POSES), look % POSES) for look in pair]
         if pair not in self._matched:
             self._matched[pair] = matched_parts(*own)
-        ends = (
+        here, there = (
             stretched_parts(parts, each, self._size_m(look), size_m)
             for parts, each, look in zip(self._matched[pair], own, pair, strict=True)
         )
-        return blend_parts(*ends, share)
+        return blend_parts(here, there, share)
 
     def looks(self, codes: Float[Tensor, "*objects codes"]) -> Int[Tensor, "*objects"]:
         """The look whose code is nearest, the first of equal ones; 0 if there are no prototypes
