@@ -70,7 +70,8 @@ OWNERS = {
     "fast_simplification": ["sceneprior/core/geometry/isosurface.py"],
     "sklearn": ["sceneprior/evaluation/", "sceneprior/lifted/sampler/stage"],
     "scipy.optimize": [
-        "sceneprior/core/overlaps.py", "sceneprior/paper/losses/matching.py",
+        "sceneprior/core/overlaps.py", "sceneprior/core/geometry/part_blends.py",
+        "sceneprior/paper/losses/matching.py",
         "sceneprior/evaluation/", "data_prep/inspection/truth_causes.py",
     ],
     "cv2": ["data_prep/posed/lens.py", "sceneprior/evaluation/metrics/"],

@@ -99,6 +99,11 @@ class DecodedScenes:
     looks: Int[Tensor, "rooms objects"] | None = None
     """Look of each object, that is, its prototype and pose as one index: prototype * 8 + pose
     (`lifted/prototypes.py`). None before the shape decoder has run, and if it predicts meshes."""
+    next_looks: Int[Tensor, "rooms objects"] | None = None
+    """Look into which the shape of each object changes along a path; None for rooms by themselves.
+    """
+    shares: Float[Tensor, "rooms objects"] | None = None
+    """Share of `next_looks` in each object's shape, at least 0 and less than 1."""
 
 
 @dataclass(frozen=True)

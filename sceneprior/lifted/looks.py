@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from pydantic import Field
 from torch import Tensor, nn
 
+from sceneprior.core.geometry.part_blends import blend_parts, matched_parts
 from sceneprior.core.geometry.part_meshes import stretched, surface_of_parts
 from sceneprior.core.geometry.turns import quarter_rotation
 from sceneprior.core.parts import (
@@ -24,6 +25,7 @@ from sceneprior.core.parts import (
 )
 from sceneprior.core.scene import Mesh, Solid
 from sceneprior.core.views import DecodedScenes
+from sceneprior.lifted.look_paths import posed_parts, shown_looks, stretched_parts
 from sceneprior.lifted.prototypes import (
     POSES,
     Prototypes,
@@ -101,6 +103,7 @@ class LookDecoder(ShapeModule):
         self.register_buffer("look_codes", torch.zeros(most * POSES, config.codes))
         self.register_buffer("spread", torch.ones(()))
         self._meshes: dict[int, Mesh] = {}
+        self._matched: dict[tuple[int, int], tuple[Parts, Parts]] = {}
 
     def learn_prototypes(self, prototypes: Prototypes) -> None:
         """Set the prototypes whose looks are decoded."""
@@ -168,15 +171,57 @@ class LookDecoder(ShapeModule):
         looks = None if with_shape is False else self.looks(codes)
         return replace(scenes, shape_codes=codes, looks=looks)
 
+    def along_path(
+        self,
+        rooms: DecodedScenes,
+        places: Float[Tensor, " rooms"],
+        path: DecodedScenes,
+        kept: Bool[Tensor, "steps objects"],
+    ) -> DecodedScenes:
+        if rooms.looks is None or path.looks is None:
+            return rooms
+        looks, next_looks = rooms.looks.clone(), rooms.looks.clone()
+        shares = torch.zeros_like(looks, dtype=torch.float64)
+        for item in range(looks.shape[1]):
+            shown = shown_looks(path.looks[:, item].cpu().numpy(), kept[:, item].cpu().numpy())
+            for room, place in enumerate(places.tolist() if shown else []):
+                nearest = min(shown, key=lambda each: each.apart(place))
+                looks[room, item], next_looks[room, item], shares[room, item] = nearest.at(place)
+        return replace(rooms, looks=looks, next_looks=next_looks, shares=shares)
+
     def mesh_of(self, decoded: DecodedScenes, room: int, item: int) -> Mesh | None:
         if decoded.looks is None:
             return None
-        return self.mesh(int(decoded.looks[room, item]), _box_m(decoded, room, item))
+        box_m, blend = _box_m(decoded, room, item), self._blend(decoded, room, item)
+        if blend is None:
+            return self.mesh(int(decoded.looks[room, item]), box_m)
+        vertices, faces = surface_of_parts(blend)
+        return Mesh(vertices * box_m[3:] + box_m[:3], faces)
 
     def solids_of(self, decoded: DecodedScenes, room: int, item: int) -> tuple[Solid, ...]:
         if decoded.looks is None:
             return ()
-        return self.solids(int(decoded.looks[room, item]), _box_m(decoded, room, item))
+        box_m, blend = _box_m(decoded, room, item), self._blend(decoded, room, item)
+        if blend is None:
+            return self.solids(int(decoded.looks[room, item]), box_m)
+        return _solids_in(blend, box_m)
+
+    def _blend(self, decoded: DecodedScenes, room: int, item: int) -> Parts | None:
+        """The parts of a shape between two looks, in the frame of its box; None if the prediction
+        has one look."""
+        if decoded.shares is None or not (share := float(decoded.shares[room, item])):
+            return None
+        assert decoded.looks is not None and decoded.next_looks is not None
+        size_m = _box_m(decoded, room, item)[3:]
+        pair = int(decoded.looks[room, item]), int(decoded.next_looks[room, item])
+        own = [posed_parts(self.parts(look // POSES), look % POSES) for look in pair]
+        if pair not in self._matched:
+            self._matched[pair] = matched_parts(*own)
+        here, there = (
+            stretched_parts(parts, each, self._size_m(look), size_m)
+            for parts, each, look in zip(self._matched[pair], own, pair, strict=True)
+        )
+        return blend_parts(here, there, share)
 
     def looks(self, codes: Float[Tensor, "*objects codes"]) -> Int[Tensor, "*objects"]:
         """The look whose code is nearest, the first of equal ones; 0 if there are no prototypes
@@ -206,16 +251,13 @@ class LookDecoder(ShapeModule):
 
     def solids(self, look: int, box_m: Float[np.ndarray, "6"]) -> tuple[Solid, ...]:
         """The solids of a look in a box (centre, full extents), as `mesh` places its surface."""
-        kinds, ends = zip(*self.parts(look // POSES).solids(), strict=True)
-        corners = np.stack(ends).transpose(0, 2, 1).reshape(-1, 3)
-        placed_m = np.sort(self._in_box(corners, look, box_m).reshape(-1, 2, 3), axis=1)
-        # A part in the middle is its own mirror image, to rounding.
-        _, first = np.unique(placed_m.round(5), axis=0, return_index=True)
-        low_m, high_m = placed_m.swapaxes(0, 1).tolist()
-        return tuple(
-            Solid(KIND_NAMES[kinds[row]], tuple(low_m[row]), tuple(high_m[row]))
-            for row in sorted(first)
-        )
+        own = posed_parts(self.parts(look // POSES), look % POSES)
+        return _solids_in(stretched_parts(own, own, self._size_m(look), box_m[3:]), box_m)
+
+    def _size_m(self, look: int) -> Float[np.ndarray, "3"]:
+        """Extents of the prototype of a look, in its pose."""
+        size_m = self.sizes_m[look // POSES].double().cpu().numpy()
+        return turned_extents(size_m[None], look % POSES)[0]
 
     def _in_box(
         self, points: Float[np.ndarray, "points 3"], look: int, box_m: Float[np.ndarray, "6"]
@@ -245,6 +287,18 @@ class LookDecoder(ShapeModule):
 def _box_m(decoded: DecodedScenes, room: int, item: int) -> Float[np.ndarray, "6"]:
     box_m = torch.cat((decoded.centers_m[room, item], decoded.sizes_m[room, item]))
     return np.asarray(box_m.double().cpu().numpy())
+
+
+def _solids_in(parts: Parts, box_m: Float[np.ndarray, "6"]) -> tuple[Solid, ...]:
+    """Parts without mirror images, in the frame of a box (centre, full extents), as solids."""
+    placed_m = parts.ends.swapaxes(1, 2) * box_m[3:] + box_m[:3]
+    # A part in the middle is its own mirror image, to rounding.
+    _, first = np.unique(placed_m.round(5), axis=0, return_index=True)
+    low_m, high_m = placed_m.swapaxes(0, 1).tolist()
+    return tuple(
+        Solid(KIND_NAMES[parts.kind[row]], tuple(low_m[row]), tuple(high_m[row]))
+        for row in sorted(first)
+    )
 
 
 def _padded(outline: Float[np.ndarray, "corners 2"]) -> Float[Tensor, "most 2"]:

@@ -1,11 +1,11 @@
 """Decode latents into scenes."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sceneprior.core.classes import VOID, label_set
@@ -30,6 +30,13 @@ class DecodedRoom(NamedTuple):
     class_logits: Float[Tensor, "objects classes"]
 
 
+def kept_predictions(decoded: DecodedScenes, target: str) -> Bool[Tensor, "rooms objects"]:
+    """True for predictions that are objects: the completeness scores keep them, and their most
+    likely class is not `void`, which stands for no piece of furniture."""
+    kept = kept_objects(decoded.completeness_logits, target)
+    return kept & (decoded.class_logits.argmax(dim=-1) != VOID)
+
+
 def to_rooms(
     decoded: DecodedScenes,
     prior: ScenePrior,
@@ -37,14 +44,11 @@ def to_rooms(
     names: Sequence[str],
     completeness_target: str = "first_n",
 ) -> list[DecodedRoom]:
-    """Convert decoded rooms to scenes of those predictions that the completeness scores keep.
+    """Convert decoded rooms to scenes of their `kept_predictions`, with their most likely classes.
 
-    An object has its most likely class. Predictions whose most likely class is `void` are left out:
-    the network treats void like any other class, but it stands for no piece of furniture. `prior`
-    is the network that decoded the rooms.
+    `prior` is the network that decoded the rooms.
     """
-    kept = kept_objects(decoded.completeness_logits, completeness_target)
-    kept = kept & (decoded.class_logits.argmax(dim=-1) != VOID)
+    kept = kept_predictions(decoded, completeness_target)
     rooms = []
     for row, name in enumerate(names):
         predictions = kept[row].nonzero()[:, 0].tolist()
@@ -81,9 +85,14 @@ def scene_of(
 @single_threaded()
 @torch.no_grad()
 def decode_rooms(
-    trained: TrainedPrior, z: Float[Tensor, "rooms width"], names: Sequence[str]
+    trained: TrainedPrior,
+    z: Float[Tensor, "rooms width"],
+    names: Sequence[str],
+    reshaped: Callable[[DecodedScenes, slice], DecodedScenes] = lambda decoded, rows: decoded,
 ) -> list[DecodedRoom]:
     """Decode latents into rooms, with meshes unless the run has only trained its layout stage.
+
+    `reshaped` may change the shapes of some of the rooms before they become scenes.
 
     Decoding runs on one thread: the networks are too small to gain from several, and on one thread
     equal latents give bit-identical rooms.
@@ -94,6 +103,7 @@ def decode_rooms(
         part = slice(start, start + BATCH)
         decoded = trained.prior.decode(z[part], with_shape=trained.stage != "layout")
         target = config.model.completeness_target
+        decoded = reshaped(decoded, part)
         rooms += to_rooms(decoded, trained.prior, config.label_set, names[part], target)
     return [
         room._replace(scene=replace(room.scene, latent=point.cpu().numpy()))

@@ -2,12 +2,13 @@
 animation."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from sceneprior.core.classes import VOID, label_set
@@ -15,12 +16,16 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.files import write_whole
 from sceneprior.core.palette import quiet_colors
 from sceneprior.core.scene import Scene
-from sceneprior.paper.decode import DecodedRoom, decode_rooms
+from sceneprior.core.threads import single_threaded
+from sceneprior.core.views import DecodedScenes
+from sceneprior.paper.decode import DecodedRoom, decode_rooms, kept_predictions
 from sceneprior.paper.sampling import Point, latent_of
 from sceneprior.paper.trained import TrainedPrior
 from sceneprior.render.pictures import contact_sheet, gif_bytes, png_bytes
 from sceneprior.render.topdown import corner_view, perspective
 
+STEPS = 129
+"""Points of a path at which looks are decoded, to find where each one holds."""
 TILE = (240, 320)
 """Height and width in pixels of a picture in the strip, and of the animation."""
 STRIP_COLUMNS = 9
@@ -33,6 +38,55 @@ PAUSE_MS = 700
 """Milliseconds for which the animation shows the first and the last picture before it reverses."""
 
 
+@dataclass(frozen=True)
+class RoomPath:
+    """The geodesic between two latents (in a cube, the straight line) and the rooms on it.
+
+    A place on it is a number from 0 to 1. Rooms at 0 and 1 are those that the latents decode to;
+    between them, shapes change gradually (`ShapeModule.along_path`), however many rooms are drawn.
+    """
+
+    trained: TrainedPrior
+    start: Float[Tensor, " dimension"]
+    end: Float[Tensor, " dimension"]
+
+    def latents(self, places: Float[Tensor, " rooms"]) -> Float[Tensor, "rooms dimension"]:
+        """The latents at these places.
+
+        Raises:
+            InputError: the two ends are antipodal.
+        """
+        start, end = (z.expand(len(places), -1) for z in (self.start, self.end))
+        try:
+            return self.trained.prior.latent_space.between(start, end, places.to(start.dtype))
+        except ValueError:
+            raise InputError(
+                "The two ends are opposite points of the sphere, and every great circle leads from "
+                "one to the other; choose another end, or go by way of a third room."
+            ) from None
+
+    def rooms(self, places: Float[Tensor, " rooms"], names: Sequence[str]) -> list[DecodedRoom]:
+        """The rooms at these places."""
+
+        def reshaped(decoded: DecodedScenes, rows: slice) -> DecodedScenes:
+            return self.trained.prior.shape.along_path(decoded, places[rows], *self._decoded)
+
+        return decode_rooms(self.trained, self.latents(places), names, reshaped)
+
+    @cached_property
+    def _decoded(self) -> tuple[DecodedScenes, Bool[Tensor, "steps objects"]]:
+        """The path at `STEPS` equal steps, and which predictions are objects."""
+        z = self.latents(even_places(STEPS))
+        with torch.no_grad(), single_threaded():
+            path = self.trained.prior.decode(z, with_shape=self.trained.stage != "layout")
+        return path, kept_predictions(path, self.trained.config.model.completeness_target)
+
+
+def even_places(steps: int) -> Float[Tensor, " steps"]:
+    """Evenly spaced places on a path, including both ends."""
+    return torch.linspace(0, 1, steps, dtype=torch.float64)
+
+
 def interpolate(trained: TrainedPrior, start: Point, end: Point, steps: int) -> list[Scene]:
     """Rooms `step_00`, `step_01`, ... on the way from one latent to another.
 
@@ -40,37 +94,19 @@ def interpolate(trained: TrainedPrior, start: Point, end: Point, steps: int) -> 
     object's prediction: objects with the same slot in two rooms are the same object, moved. `steps`
     includes both ends; `start` and `end` are anything that `latent_of` accepts.
     """
-    z = path_latents(trained, latent_of(trained, start), latent_of(trained, end), steps)
-    names = [f"step_{k:02d}" for k in range(steps)]
+    path = RoomPath(trained, latent_of(trained, start), latent_of(trained, end))
+    places = even_places(steps)
     ends = {"from": _name_of(start), "to": _name_of(end)}
     scenes = []
-    for step, room in enumerate(decode_rooms(trained, z, names)):
-        along = round(step / (steps - 1), 6)
-        extra = {**ends, "along": along, "slots": room.predictions}
+    rooms = path.rooms(places, [f"step_{k:02d}" for k in range(steps)])
+    for along, room in zip(places.tolist(), rooms, strict=True):
+        extra = {**ends, "along": round(along, 6), "slots": room.predictions}
         scenes.append(replace(room.scene, extra=extra))
     return scenes
 
 
 def _name_of(point: Point) -> str:
     return point if isinstance(point, str) else getattr(point, "name", None) or "a latent"
-
-
-def path_latents(
-    trained: TrainedPrior,
-    start: Float[Tensor, " dimension"],
-    end: Float[Tensor, " dimension"],
-    steps: int,
-) -> Float[Tensor, "steps dimension"]:
-    """Evenly spaced points on the geodesic (in a cube, the straight line), including both ends."""
-    along = torch.linspace(0, 1, steps, dtype=start.dtype)
-    try:
-        space = trained.prior.latent_space
-        return space.between(start.expand(steps, -1), end.expand(steps, -1), along)
-    except ValueError:
-        raise InputError(
-            "The two ends are opposite points of the sphere, and every great circle leads from "
-            "one to the other; choose another end, or go by way of a third room."
-        ) from None
 
 
 def mixed_colors(room: DecodedRoom) -> UInt8[np.ndarray, "objects 3"]:
@@ -102,8 +138,8 @@ def write_pictures(trained: TrainedPrior, scenes: Sequence[Scene], folder: Path)
     """Write `strip.png`, which shows `scenes` (the rooms of `interpolate`), and `animation.gif`,
     which has `BETWEEN` pictures per step."""
     start, end = (latent_of(trained, scene) for scene in (scenes[0], scenes[-1]))
-    z = path_latents(trained, start, end, (len(scenes) - 1) * BETWEEN + 1)
-    rooms = decode_rooms(trained, z, [""] * len(z))
+    places = even_places((len(scenes) - 1) * BETWEEN + 1)
+    rooms = RoomPath(trained, start, end).rooms(places, [""] * len(places))
     view = corner_view([room.scene for room in rooms], TILE)
     pictures = [perspective(room.scene, view=view, colors=mixed_colors(room)) for room in rooms]
     write_whole(folder / "strip.png", png_bytes(strip(pictures[::BETWEEN])))

@@ -52,6 +52,20 @@ class ShapeModule(nn.Module, ABC):
     ) -> DecodedScenes:
         """The decoded layouts with shapes added; the arguments are those of `ScenePrior.decode`."""
 
+    def along_path(
+        self,
+        rooms: DecodedScenes,
+        places: Float[Tensor, " rooms"],
+        path: DecodedScenes,
+        kept: Bool[Tensor, "steps objects"],
+    ) -> DecodedScenes:
+        """Rooms at places (0 to 1) of a path, with shapes that change gradually along it.
+
+        `path` has the rooms at equal steps from 0 to 1, and `kept` their predictions that are
+        objects. Meshes of a network change gradually by themselves.
+        """
+        return rooms
+
     @abstractmethod
     def mesh_of(self, decoded: DecodedScenes, room: int, item: int) -> Mesh | None:
         """The mesh of prediction `item`; None if shapes were not decoded."""

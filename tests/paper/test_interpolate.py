@@ -9,16 +9,18 @@ import torch
 from PIL import Image
 from torch import nn
 
+import sceneprior
 from sceneprior.core.errors import InputError
 from sceneprior.core.palette import quiet_colors
 from sceneprior.core.views import DecodedScenes
 from sceneprior.paper.decode import decode_latents, decode_rooms
 from sceneprior.paper.interpolate import (
     TILE,
+    RoomPath,
     animation,
+    even_places,
     interpolate,
     mixed_colors,
-    path_latents,
     strip,
     write_pictures,
 )
@@ -47,14 +49,14 @@ def test_steps_are_even_and_end_where_they_should(trained):
 def test_opposite_ends_are_a_sentence_and_in_a_cube_no_trouble(trained):
     start = trained.prior.latent_space(trained.logits[:1])[0]
     with pytest.raises(InputError) as error:
-        path_latents(trained, start, -start, 5)
+        RoomPath(trained, start, -start).latents(even_places(5))
     assert str(error.value) == (
         "The two ends are opposite points of the sphere, and every great circle leads from one to "
         "the other; choose another end, or go by way of a third room."
     )
 
     cubic = replace(trained, prior=Cubic())
-    z = path_latents(cubic, start, -start, 5)
+    z = RoomPath(cubic, start, -start).latents(even_places(5))
     torch.testing.assert_close(z[2], torch.zeros(16), rtol=0, atol=1e-7)
 
 
@@ -109,6 +111,27 @@ def test_objects_are_known_by_their_prediction_and_colours_never_jump(trained):
     colors = np.array([mixed_colors(room)[1] for room in turned], dtype=int)
     ends = np.abs(colors[0] - colors[-1]).max()
     assert ends > 20 and np.abs(np.diff(colors, axis=0)).max() <= 0.04 * ends + 1
+
+
+def test_ends_are_the_decoded_rooms_and_shapes_between_are_blends():
+    prior = sceneprior.load("demo-bedroom").with_latents
+    z = prior.prior.latent_space(prior.logits)
+    path, places = RoomPath(prior, z[3], z[90]), even_places(5)
+    rooms = path.rooms(places, [str(k) for k in range(5)])
+    plain = decode_rooms(prior, path.latents(places), [str(k) for k in range(5)])
+    for one, other in zip(rooms, plain, strict=True):
+        np.testing.assert_array_equal(one.scene.centers_m, other.scene.centers_m)
+        assert one.predictions == other.predictions
+    between = zip(rooms[2].scene.objects, plain[2].scene.objects, strict=True)
+    assert any(here.solids != there.solids for here, there in between)
+    for one, other in ((rooms[0], plain[0]), (rooms[-1], plain[-1])):
+        for here, there in zip(one.scene.objects, other.scene.objects, strict=True):
+            np.testing.assert_array_equal(here.mesh.vertices_m, there.mesh.vertices_m)
+            assert here.solids == there.solids
+    # The middle room of a path of 3 is that of a path of 5, to rounding of the latent.
+    middle = path.rooms(even_places(3), [""] * 3)[1]
+    for here, there in zip(middle.scene.objects, rooms[2].scene.objects, strict=True):
+        np.testing.assert_allclose(here.mesh.vertices_m, there.mesh.vertices_m, atol=2e-3)
 
 
 def test_pictures_are_taken_from_one_view(trained, tmp_path):

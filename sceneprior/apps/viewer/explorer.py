@@ -21,7 +21,7 @@ from sceneprior.evaluation.metrics.contents import common_label_set
 from sceneprior.lifted.looks import LookDecoder
 from sceneprior.lifted.trained import SAMPLER, TrainedLifted
 from sceneprior.paper.decode import decode_latents, to_rooms
-from sceneprior.paper.interpolate import path_latents
+from sceneprior.paper.interpolate import RoomPath, even_places
 from sceneprior.paper.sampling import DISTRIBUTIONS, named_latent
 from sceneprior.paper.trained import TrainedPrior, with_training_latents
 
@@ -90,7 +90,7 @@ class Explorer:
             self.map = make_map(prior.with_latents.prior.latent_space, self._training_z)
         except InputError as error:
             self.without_map = str(error)
-        self.path: Float[Tensor, "steps dimension"] | None = None
+        self.path: RoomPath | None = None
 
     @property
     def has_latents(self) -> bool:
@@ -173,14 +173,17 @@ class Explorer:
             else named_latent(self.prior.with_latents, text.strip(), f"{HERE}, the shown room")
             for text in (start, end)
         ]
-        self.path = path_latents(self.prior.with_latents, ends[0], ends[1], PATH_STEPS)
-        return self.path
+        path = RoomPath(self.prior.with_latents, ends[0], ends[1])
+        z = path.latents(even_places(PATH_STEPS))
+        self.path = path
+        return z
 
     def step(self, number: int) -> Shown:
         """The room at a step of the path, counted from 0."""
         assert self.path is not None, "a path is drawn first"
-        name = f"step_{number:02d}"
-        return self._decoded(self.path[number], name, f"path, step {number} of {PATH_STEPS - 1}")
+        place = even_places(PATH_STEPS)[[number]]
+        (room,) = self.path.rooms(place, [f"step_{number:02d}"])
+        return Shown(room.scene, f"path, step {number} of {PATH_STEPS - 1}")
 
     def complete(self, shown: Shown, seed: int, want: str = "") -> Shown:
         """Keep the kept objects, and complete the room around them, with wishes if there are any.

@@ -1,0 +1,90 @@
+"""Looks along a path of rooms: where each is shown, and its parts in an object's box."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from sceneprior.core.geometry.part_meshes import stretched
+from sceneprior.core.geometry.turns import quarter_rotation
+from sceneprior.core.parts import SQUARE, Parts
+from sceneprior.lifted.prototypes import turn_of
+
+HOLD = 0.125
+"""Share of the path for which a look between two others must hold to be shown. A smaller share
+follows the decoder more closely, and objects change faster."""
+
+
+class Shown(NamedTuple):
+    """Looks that a prediction shows during one of its appearances, and where on the path."""
+
+    places: Float[np.ndarray, " shown"]
+    looks: Int[np.ndarray, " shown"]
+
+    def apart(self, place: float) -> float:
+        """Distance of a place on the path from this appearance."""
+        return float(np.abs(place - np.clip(place, *self.places[[0, -1]])))
+
+    def at(self, place: float) -> tuple[int, int, float]:
+        """The two looks between which the shape is, and the share of the second, below 1."""
+        after = int(np.searchsorted(self.places, place, side="right"))
+        look, next_look = self.looks[max(after - 1, 0)], self.looks[min(after, len(self.looks) - 1)]
+        if after in (0, len(self.looks)) or look == next_look:
+            return int(look), int(look), 0.0
+        start, end = self.places[after - 1 : after + 1]
+        return int(look), int(next_look), float((place - start) / (end - start))
+
+
+def shown_looks(looks: Int[np.ndarray, " steps"], kept: Bool[np.ndarray, " steps"]) -> list[Shown]:
+    """The looks that one prediction shows on a path, for each of its appearances.
+
+    `looks` has the decoded look at equal steps from 0 to 1, and `kept` is true where the prediction
+    is an object. The first and last look of an appearance are shown at its ends. A look between
+    them that holds for at least `HOLD` is shown in the middle of the steps where it holds.
+    """
+    places = np.linspace(0, 1, len(looks))
+    changes = np.flatnonzero(np.diff(np.where(kept, looks, -1))) + 1
+    found = []
+    for steps in np.split(np.arange(len(looks)), np.flatnonzero(np.diff(kept)) + 1):
+        if not kept[steps[0]]:
+            continue
+        within = changes[(changes > steps[0]) & (changes <= steps[-1])] - steps[0]
+        ends = places[steps[[0, -1]]]
+        between = [
+            (places[run[[0, -1]]].mean(), looks[run[0]])
+            for run in np.split(steps, within)[1:-1]
+            if len(run) >= HOLD * (len(looks) - 1)
+        ]
+        shown = [(ends[0], looks[steps[0]]), *between, (ends[1], looks[steps[-1]])]
+        found.append(Shown(*map(np.array, zip(*shown, strict=True))))
+    return found
+
+
+def posed_parts(parts: Parts, pose: int) -> Parts:
+    """The parts of a prototype in a pose, with its mirror images as parts of their own."""
+    quarters, mirrored = turn_of(pose)
+    across = quarter_rotation(quarters) * ([-1, 1, 1] if mirrored else [1, 1, 1])
+    kind, ends = zip(*parts.solids(), strict=True)
+    outline = parts.outline
+    if not np.array_equal(outline, SQUARE):
+        outline = outline @ across[::2, ::2].T
+        outline = outline[::-1] if mirrored else outline  # stays counter-clockwise
+    return Parts(
+        np.array(kind), np.zeros(len(kind), np.int64), np.sort(across @ np.stack(ends)), outline
+    )
+
+
+def stretched_parts(
+    parts: Parts, own: Parts, size_m: Float[np.ndarray, "3"], new_size_m: Float[np.ndarray, "3"]
+) -> Parts:
+    """Parts in the frame of an object of extents `size_m`, which consists of `own`, after its box
+    gets other extents (`stretched`)."""
+
+    def moved(points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 3"]:
+        return stretched(points, own, size_m, new_size_m)
+
+    corners = moved(parts.ends.transpose(0, 2, 1).reshape(-1, 3))
+    outline = parts.outline
+    if not np.array_equal(outline, SQUARE):
+        outline = moved(np.insert(outline, 1, 0.0, axis=1))[:, ::2]
+    return parts._replace(ends=corners.reshape(-1, 2, 3).transpose(0, 2, 1), outline=outline)
