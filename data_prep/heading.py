@@ -6,7 +6,7 @@ direction only. So each pixel of an outline votes for that direction, modulo 90 
 most frequent direction is the room's. Depths, the floor and 3D boxes are not needed.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int, Integer
@@ -85,7 +85,7 @@ def note_of_turn(degrees: float | None) -> list[str]:
     return [f"turned by {degrees:.2f} degrees, along its walls and furniture"] if degrees else []
 
 
-def _folded(yaw_rad: Float[np.ndarray, "*any"] | float) -> Float[np.ndarray, "*any"] | float:
+def _folded(yaw_rad: Any) -> Any:
     """The angle from -45 to 45 degrees that differs by whole quarter turns."""
     return (yaw_rad + _QUARTER / 2) % _QUARTER - _QUARTER / 2
 

@@ -172,7 +172,7 @@ class Shard(contextlib.AbstractContextManager["Shard"]):
         with self._group(room_id) as group:
             height, width = (int(side) for side in group.attrs["image_size"])
             sizes = {"H": height, "W": width}
-            arrays = read_arrays(group, VIEW_ARRAYS, sizes, self._classes)
+            arrays: dict[str, Any] = read_arrays(group, VIEW_ARRAYS, sizes, self._classes)
             sizes |= dict(zip("hw", stuff_size((height, width)), strict=True))
             read: dict[str, Any] = {"stuff": None}
             for name, check in (("instance_ids", known_ids), ("stuff", known_stuff)):
@@ -182,7 +182,7 @@ class Shard(contextlib.AbstractContextManager["Shard"]):
                 if stored.shape != (shape := shape_of(IMAGES[name], sizes)):
                     raise ValueError(f"{name} has shape {stored.shape}, expected {shape}")
                 read[name] = check(group, stored[()]) if images else None
-            read |= read_turn(group)
+            arrays |= read_turn(group)
         return RoomViews(room_id=room_id, image_size=(height, width), **read, **arrays)
 
     def read_instance_ids(self, room_id: str, views: Sequence[int], step: int = 1) -> np.ndarray:
