@@ -38,7 +38,9 @@ def iou_upright(
         return shapely.polygons((CORNERS * sizes[:, None, ::2]) @ turns.mT + centers[:, None, ::2])
 
     area = shapely.area(shapely.intersection(footprints(centers, sizes, yaw), footprints(*others)))
-    ends = [(c[:, 1] - s[:, 1] / 2, c[:, 1] + s[:, 1] / 2) for c, s in ((centers, sizes), others[:2])]
+    ends = [
+        (c[:, 1] - s[:, 1] / 2, c[:, 1] + s[:, 1] / 2) for c, s in ((centers, sizes), others[:2])
+    ]
     (low, high), (other_low, other_high) = ends
     shared = area * np.maximum(np.minimum(high, other_high) - np.maximum(low, other_low), 0)
     return shared / (sizes.prod(axis=1) + others[1].prod(axis=1) - shared)
@@ -59,7 +61,9 @@ def given(views: RoomViews, noisy: bool, seed: int) -> RoomViews:
     return replace(made, stuff=views.stuff), seen.tracked
 
 
-def lifted_iou(views: RoomViews, truth: RoomGroundTruth, rows: np.ndarray, yaw: float) -> np.ndarray:
+def lifted_iou(
+    views: RoomViews, truth: RoomGroundTruth, rows: np.ndarray, yaw: float
+) -> np.ndarray:
     """IoU of boxes lifted in a turned room with the true boxes, turned by the yaw."""
     boxes = lift_boxes(views)
     count = len(rows)
@@ -128,15 +132,24 @@ def main() -> None:
             table = np.array(list(pieces(folder, rooms(*some))))
             off = table[:, 0] > OFF_DEG
             print(f"| {folder.name} | {off.sum()} / {len(off)} | {off.mean():.1%}", end=" ")
-            print(*(f"| {x:.3f}" for part in (table[off], table[~off]) for x in part[:, 1:4].mean(axis=0)), "|")
+            print(
+                *(
+                    f"| {x:.3f}"
+                    for part in (table[off], table[~off])
+                    for x in part[:, 1:4].mean(axis=0)
+                ),
+                "|",
+            )
             continue
         for noisy in map(bool, options.noise):
             for stuff in (False, True):
-                found = np.array([
-                    score(views, truth, noisy, stuff, 1000 * seed + place)
-                    for seed in options.seeds
-                    for place, (views, truth) in enumerate(rooms(*some))
-                ])
+                found = np.array(
+                    [
+                        score(views, truth, noisy, stuff, 1000 * seed + place)
+                        for seed in options.seeds
+                        for place, (views, truth) in enumerate(rooms(*some))
+                    ]
+                )
                 error = found[~np.isnan(found[:, 0]), 0]
                 print(
                     f"| {folder.name} | {'noisy' if noisy else 'clean'} "

@@ -361,3 +361,24 @@ def test_attributes_of_another_format_name_the_file(tmp_path):
             file[group].attrs[name] = value
         with pytest.raises(ShardError, match=r"a\.h5 (cannot be read|says format)"):
             Shard(path)
+
+
+def test_the_turn_of_a_room_is_an_attribute_of_turned_rooms_only(tmp_path):
+    path, matrix = tmp_path / "a.h5", np.eye(4)
+    matrix[:3, 3] = 0.1, 0.2, 0.3
+    room = make_room()
+    turned = replace(room, room_id="turned", turned_deg=-33.25, room_from_world=matrix)
+    write_shard(path, "front3d_bedroom", [(room, None), (turned, None)])
+    assert room_checksum(turned, None) != room_checksum(replace(turned, turned_deg=1.0), None)
+    with Shard(path) as shard:
+        assert_same(shard.read_room("turned", images=True), turned)
+        read = shard.read_room("turned", images=True)
+        assert shard.read_checksum("turned") == room_checksum(read, None)
+    with h5py.File(path, "a") as file:
+        assert set(file["rooms/house_A"].attrs) == {"room_id", "image_size", "sha256"}
+        file["rooms/turned"].attrs["room_from_world"] = np.full((4, 4), np.nan)
+    message = (
+        r"room turned cannot be read \(turned_deg -33\.25 and room_from_world .* are no turn\)"
+    )
+    with Shard(path) as shard, pytest.raises(ShardError, match=message):
+        shard.read_room("turned")
