@@ -10,12 +10,13 @@ import argparse
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import shapely
 import trimesh
+from tracks import ideal_ids, rooms, shuffled
 
-from benchmarks.tracks import ideal_ids, rooms, shuffled
 from data_prep.heading import find_turn, turn_matrix
 from sceneprior.core.geometry.turns import yaw_rotation
 from sceneprior.core.instances.observations import observe
@@ -23,7 +24,6 @@ from sceneprior.core.shards import MODELS_FOLDER, RoomGroundTruth, RoomViews
 from sceneprior.lifted.lifting.boxes import lift_boxes
 
 CORNERS = np.array([(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)])
-LEVEL = np.ix_([0, 2], [0, 2])
 OFF_DEG = 10.0
 """Angle with both axes from which on a piece counts as turned."""
 
@@ -34,7 +34,7 @@ def iou_upright(
     """IoU of n pairs of upright boxes: centres, sizes (n, 3), and yaws (n,) of both."""
 
     def footprints(centers: np.ndarray, sizes: np.ndarray, yaw: np.ndarray) -> np.ndarray:
-        turns = yaw_rotation(yaw)[(..., *LEVEL)]
+        turns = yaw_rotation(yaw)[:, ::2, ::2]
         return shapely.polygons((CORNERS * sizes[:, None, ::2]) @ turns.mT + centers[:, None, ::2])
 
     area = shapely.area(shapely.intersection(footprints(centers, sizes, yaw), footprints(*others)))
@@ -102,7 +102,7 @@ def pieces(
         for k in range(count):
             yaw = float(truth.yaw_rad[k])
             off = abs((np.degrees(yaw) + 45) % 90 - 45)
-            model = trimesh.load(folder / MODELS_FOLDER / f"{truth.model_ids[k]}.ply")
+            model: Any = trimesh.load(folder / MODELS_FOLDER / f"{truth.model_ids[k]}.ply")
             place = truth.model_to_room[k].astype(np.float64)
             points = (model.vertices @ place[:3, :3].T + place[:3, 3]) @ yaw_rotation(yaw)
             low, high = points.min(axis=0), points.max(axis=0)
