@@ -254,6 +254,7 @@ def test_folders(tmp_path):
 
 def test_a_checksum_covers_everything_and_survives_the_file(tmp_path):
     room, truth = with_stuff(make_room()), make_truth()
+    room = replace(room, turned_deg=12.5, room_from_world=np.eye(4))
     write_shard(tmp_path / "a.h5", "front3d_bedroom", [(room, truth), (make_room("bare"), None)])
     with Shard(tmp_path / "a.h5") as shard:
         assert shard.has_ground_truth("house_A") and not shard.has_ground_truth("bare")
@@ -269,9 +270,9 @@ def test_a_checksum_covers_everything_and_survives_the_file(tmp_path):
                 other = value.copy()
                 other.flat[-1] = other.flat[-1] == 0
             else:
-                other = {"room_id": "b", "image_size": (16, 12), "height_m": 3.0}.get(
-                    item.name, ("a", "b", "c")
-                )
+                other = {
+                    "room_id": "b", "image_size": (16, 12), "height_m": 3.0, "turned_deg": 9.0,
+                }.get(item.name, ("a", "b", "c"))  # fmt: skip
             both = [room, truth]
             both[pair] = replace(of, **{item.name: other})
             assert room_checksum(*both) != stored, item.name
