@@ -125,9 +125,7 @@ def score(views: RoomViews, truth: RoomGroundTruth, noisy: bool, seed: int) -> S
     true, ids = views.instance_ids.astype(np.int64), frames.masks.ids
     count = len(views.object_class)
     judged = (ids > 0) & (true > 0) & (true <= count)
-    table = np.zeros((int(ids.max()) + 1, count + 2), dtype=np.int64)
-    np.add.at(table, (ids[judged], true[judged]), 1)
-    named = np.where(ids > 0, table.argmax(axis=1)[np.maximum(ids, 0)], ids)
+    named = ideal_ids(ids, views)
     iou, iou_true_ids = (
         _mean_iou(*_boxes(views, image, classes, frames.world_to_camera), truth, count)
         for image, classes in ((found.ids, found.object_class), (named, views.object_class))
@@ -135,6 +133,17 @@ def score(views: RoomViews, truth: RoomGroundTruth, noisy: bool, seed: int) -> S
     visible = observe(np.maximum(found.ids, 0).astype(np.uint32), found.object_class).tracked
     rand = rand_index(true[judged], np.maximum(found.ids[judged], 0))
     return Score(rand, len(visible), count, iou, iou_true_ids, seconds)
+
+
+def ideal_ids(ids: np.ndarray, views: RoomViews) -> np.ndarray:
+    """Images in which each mask of `shuffled` has the id of the true object with most of its
+    pixels."""
+    assert views.instance_ids is not None
+    true, count = views.instance_ids.astype(np.int64), len(views.object_class)
+    judged = (ids > 0) & (true > 0) & (true <= count)
+    table = np.zeros((int(ids.max()) + 1, count + 2), dtype=np.int64)
+    np.add.at(table, (ids[judged], true[judged]), 1)
+    return np.where(ids > 0, table.argmax(axis=1)[np.maximum(ids, 0)], ids)
 
 
 def rand_index(a: np.ndarray, b: np.ndarray) -> float:

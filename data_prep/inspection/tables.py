@@ -26,12 +26,14 @@ def count_tables(folder: Path) -> list[Table]:
     """Counts of each split, and its objects of each class."""
     names = label_set(read_index(folder)["label_set"])
     totals, classes = [], {}
+    turned: list[float] = []
     for split in SPLITS:
         if not any((folder / split).glob("*.h5")):
             continue  # the folder was made with --only
         rooms, known = [], 0
         for shard, room_id in iterate_rooms(folder, split):
-            rooms.append(shard.read_room(room_id))
+            rooms.append(room := shard.read_room(room_id))
+            turned += [abs(room.turned_deg)] if room.turned_deg else []
             known += shard.has_ground_truth(room_id)
         views, objects = (sum(room.visible.shape[axis] for room in rooms) for axis in (0, 1))
         seen = sum(int(room.visible.sum()) for room in rooms)
@@ -48,7 +50,13 @@ def count_tables(folder: Path) -> list[Table]:
     )  # fmt: skip
     every = sorted({name for counts in classes.values() for name in counts})
     rows = [(name, *(counts[name] for counts in classes.values())) for name in every]
-    return [make_table(columns, totals), make_table(("class", *classes), rows)]
+    table = make_table(columns, totals)
+    if turned:
+        table.caption = (
+            f"{len(turned)} rooms were turned to lie along their walls and furniture, by "
+            f"{min(turned):.1f} to {max(turned):.1f} degrees."
+        )
+    return [table, make_table(("class", *classes), rows)]
 
 
 def room_table(folder: Path, room_id: str) -> Table:
@@ -69,7 +77,8 @@ def room_table(folder: Path, room_id: str) -> Table:
         rows.append((k, names[index], len(boxes), share, *place))
     columns = ("object", "class", "views", "share of image", "centre, m", "size, m")
     table = make_table(columns, rows)
-    table.title = room_id
+    turned = f" (turned by {views.turned_deg:.2f} degrees)" if views.turned_deg else ""
+    table.title = f"{room_id}{turned}"
     return table
 
 

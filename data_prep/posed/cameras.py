@@ -85,7 +85,7 @@ def cameras_in_room(
     if recording.floor_center_m is not None:
         first, second = recording.floor_center_m
         level = [axis for axis in range(3) if abs(turn[1, axis]) < 0.5]
-        if len(level) != 2 or not np.isin(np.abs(turn), (0.0, 1.0)).all():
+        if len(level) != 2 or not np.isin(np.abs(turn[1]), (0.0, 1.0)).all():
             raise InputError(
                 f"{recording.path}: floor_center_m is along two level axes, but none of this "
                 "world's is level; leave it out, or turn the poses and name the axis with --up."

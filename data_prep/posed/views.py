@@ -7,6 +7,7 @@ import numpy as np
 
 from data_prep.engine.source import PreparedRoom
 from data_prep.frames import choose_frames, first_fault, room_cameras, shrunk
+from data_prep.heading import find_turn, note_of_turn, turn_matrix
 from data_prep.posed.cameras import UP, cameras_in_room, upright_cameras
 from data_prep.posed.floor import find_floor
 from data_prep.posed.mask_format import MaskFormat
@@ -122,16 +123,25 @@ def prepare_posed(
     seen = observe(images, classes)
     if not len(seen.tracked):
         return None
+    views = seen.room_views(
+        room_name(recording.folder), room_cameras(upright, np.eye(4)), intrinsics
+    )
+    if stuff.any():
+        small = (..., *thinned(stuff_step(views.image_size)))
+        views = replace(views, stuff=stuff[small] * (seen.instance_ids[small] == 0))
+    degrees = find_turn(views)
+    notes += note_of_turn(degrees)
+    if degrees:
+        upright, turn = turn_matrix(degrees) @ upright, turn_matrix(degrees) @ turn
     floor = recording.floor_m if recording.floor_m is not None else settings.floor_m
     if floor is None:
         floor, said = _unsaid_floor(seen, upright, intrinsics, settings)
         notes.append(said)
     world_to_camera = cameras_in_room(recording, upright, turn, floor)
-    views = seen.room_views(room_name(recording.folder), world_to_camera, intrinsics)
-    if stuff.any():
-        small = (..., *thinned(stuff_step(views.image_size)))
-        views = replace(views, stuff=stuff[small] * (seen.instance_ids[small] == 0))
     room_from_world = np.linalg.inv(upright[0] @ world_to_camera[0]) @ turn
+    views = replace(views, world_to_camera=world_to_camera.astype(np.float32))
+    if degrees:
+        views = replace(views, turned_deg=degrees, room_from_world=room_from_world)
     origin = {
         "file": recording.path.relative_to(recording.folder).as_posix(),
         "room_from_world": room_from_world.round(9).tolist(),

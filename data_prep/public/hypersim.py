@@ -25,7 +25,7 @@ from data_prep.engine.source import RoomTask
 from data_prep.frames import GL_TO_CV, Y_UP
 from data_prep.public.hdf5 import read_hdf5
 from data_prep.public.nyu40 import ids_and_classes
-from data_prep.public.rooms import FoundRoom, FramedRoom, Reader, box_of, chosen_frames, sampled
+from data_prep.public.rooms import FoundRoom, FramedRoom, Reader, chosen_frames, corners_of, sampled
 from data_prep.public.tilt import pinhole, straight_grid
 from sceneprior.core.errors import InputError
 from sceneprior.core.instances.checked import plain
@@ -202,7 +202,7 @@ def _boxes(folder: Path, unit: float) -> dict[int, np.ndarray]:
     turn = Y_UP[:3, :3]
     rows = zip(positions * unit, axes, extents * unit / 2, strict=True)
     return {
-        k + 1: box_of(center @ turn.T, (turn @ columns).T, half)
+        k + 1: corners_of(center @ turn.T, (turn @ columns).T, half)
         for k, (center, columns, half) in enumerate(rows)
         if np.isfinite([*center, *columns.ravel(), *half]).all() and (half > 0).all()
     }

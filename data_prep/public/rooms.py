@@ -1,7 +1,7 @@
 """Turns frames of instance ids with cameras and 3D boxes into a prepared room."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -17,9 +17,11 @@ from data_prep.frames import (
     sampled_lines,
     shrunk,
 )
+from data_prep.heading import find_turn, note_of_turn, turn_matrix
 from data_prep.scannet.labels import LABEL_SET
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
+from sceneprior.core.geometry.corners import CUBE_CORNERS
 from sceneprior.core.instances.observations import Observations, observe
 from sceneprior.core.instances.tables import IdTable, tidy
 from sceneprior.core.shards import RoomGroundTruth
@@ -39,7 +41,7 @@ class FramedRoom:
     intrinsics: np.ndarray
     """(3, 3), or (views, 3, 3), in pixels of `ids`."""
     boxes: dict[int, np.ndarray] = field(default_factory=dict)
-    """Lower and upper corner, (2, 3), of the axis-aligned box of objects, as far as known."""
+    """Points of objects, (P, 3), such as the corners of oriented boxes, as far as known."""
     floor_y: float | None = None
     """Height of the floor; None takes the lowest point of the visible objects' boxes."""
     floor_m: np.ndarray | None = None
@@ -136,8 +138,15 @@ def prepare_room(room_id: str, room: FramedRoom, label_set_name: str) -> Prepare
     seen = observe(table.ids(room.ids), table.classes)
     if not len(seen.tracked):
         return None
+    cameras = room_cameras(room.camera_to_world, np.eye(4))
+    degrees = find_turn(seen.room_views(room_id, cameras, room.intrinsics))
+    if degrees:
+        room = _turned(room, degrees)
+    boxes_of = {
+        k: np.stack([points.min(axis=0), points.max(axis=0)]) for k, points in room.boxes.items()
+    }
     tracked = [table.objects[k] for k in seen.tracked]
-    boxes = np.array([room.boxes[k] for k in tracked if k in room.boxes]).reshape(-1, 2, 3)
+    boxes = np.array([boxes_of[k] for k in tracked if k in boxes_of]).reshape(-1, 2, 3)
     eyes = room.camera_to_world[:, :3, 3]
     floor_y = room.floor_y
     if floor_y is None:
@@ -160,25 +169,41 @@ def prepare_room(room_id: str, room: FramedRoom, label_set_name: str) -> Prepare
     world_to_camera = room_cameras(room.camera_to_world, room_from_world)
     truth = None
     if len(boxes) == len(tracked):
-        tops = [eyes[:, 1].max(), *(box[1, 1] for box in room.boxes.values())]
+        tops = [eyes[:, 1].max(), *(box[1, 1] for box in boxes_of.values())]
         ceiling_y = max(tops) if room.ceiling_y is None else room.ceiling_y
-        truth = _truth(room, table, seen, origin, outline - center, float(ceiling_y - floor_y))
+        height_m = float(ceiling_y - floor_y)
+        truth = _truth(boxes_of, table, seen, origin, outline - center, height_m)
     views = seen.room_views(room_id, world_to_camera, room.intrinsics)
-    notes = list(room.notes) + table.notes
-    if room.boxes and truth is None:
+    if degrees:
+        world = room_from_world @ turn_matrix(degrees)
+        views = replace(views, turned_deg=degrees, room_from_world=world)
+    notes = [*room.notes, *table.notes, *note_of_turn(degrees)]
+    if boxes_of and truth is None:
         missing = len(tracked) - len(boxes)
         notes.append(f"{missing} of {len(tracked)} objects have no 3D box: no ground truth")
     return PreparedRoom(views, truth, notes=tuple(notes))
 
 
+def _turned(room: FramedRoom, degrees: float) -> FramedRoom:
+    """Turn the world of a room about +y."""
+    turn = turn_matrix(degrees)
+    level = turn[:3:2, :3:2]
+    return replace(
+        room,
+        camera_to_world=turn @ room.camera_to_world,
+        boxes={k: points @ turn[:3, :3].T for k, points in room.boxes.items()},
+        floor_m=None if room.floor_m is None else room.floor_m @ level.T,
+    )
+
+
 def _truth(
-    room: FramedRoom, table: IdTable, seen: Observations, origin: np.ndarray, floor_m: np.ndarray,
-    height_m: float,
+    boxes: dict[int, np.ndarray], table: IdTable, seen: Observations, origin: np.ndarray,
+    floor_m: np.ndarray, height_m: float,
 ) -> RoomGroundTruth:  # fmt: skip
     """Ground truth of the objects with a box, the visible ones first; they have no meshes."""
-    unseen = [k for k in seen.unseen if k < len(table.objects) and table.objects[k] in room.boxes]
+    unseen = [k for k in seen.unseen if k < len(table.objects) and table.objects[k] in boxes]
     order = np.array([*seen.tracked, *unseen], dtype=np.int64)
-    corners = np.array([room.boxes[table.objects[k]] for k in order]) - origin
+    corners = np.array([boxes[table.objects[k]] for k in order]) - origin
     centers_m, sizes_m = corners.mean(axis=1), corners[:, 1] - corners[:, 0]
     places = np.zeros((len(order), 4, 4))
     places[:, range(3), range(3)] = sizes_m  # from the unit cube, for want of a model
@@ -195,13 +220,12 @@ def _truth(
     )
 
 
-def box_of(center: np.ndarray, axes: np.ndarray, half: np.ndarray) -> np.ndarray:
-    """Lower and upper corner, (2, 3), of the axis-aligned box around an oriented box.
+def corners_of(center: np.ndarray, axes: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """Corners, (8, 3), of an oriented box.
 
-    The rows of `axes` are the unit axes of the oriented box, `half` its half sizes along them.
+    The rows of `axes` are the unit axes of the box, `half` its half sizes along them.
 
-        >>> box_of(np.zeros(3), np.eye(3)[[2, 1, 0]], np.array([1.0, 2, 3])).tolist()
-        [[-3.0, -2.0, -1.0], [3.0, 2.0, 1.0]]
+        >>> corners_of(np.zeros(3), np.eye(3)[[2, 1, 0]], np.array([1.0, 2, 3])).max(axis=0)
+        array([3., 2., 1.])
     """
-    reach = np.abs(axes).T @ half
-    return np.stack([center - reach, center + reach])
+    return center + CUBE_CORNERS * half @ axes

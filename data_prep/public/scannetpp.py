@@ -119,16 +119,12 @@ class ScanNetPP(Reader):
             _drawn(mesh, of_face, camera, K, stored)
             for camera, K in zip(np.linalg.inv(cameras), lenses, strict=True)
         ]
-        boxes = {
-            k + 1: np.stack([points.min(axis=0), points.max(axis=0)])
-            for k, part in enumerate(parts)
-            if len(points := mesh.vertices_m[part])
-        }
+        points = {k + 1: mesh.vertices_m[part] for k, part in enumerate(parts) if len(part)}
         floors = [part for group, part in zip(groups, parts, strict=True)
                   if labels.nyu40.get(group.category.strip().lower()) == "floor"]  # fmt: skip
         heights = mesh.vertices_m[np.concatenate(floors), 1] if floors else np.zeros(0)
         return FramedRoom(
-            np.stack(images), classes, cameras, lenses, boxes,
+            np.stack(images), classes, cameras, lenses, points,
             floor_y=float(np.median(heights)) if len(heights) else None,
             ceiling_y=float(high[1]), notes=(*notes, *choice.notes("image of ids")),
         )  # fmt: skip

@@ -24,7 +24,7 @@ from pydantic import BaseModel, RootModel
 from data_prep.engine.source import RoomTask
 from data_prep.frames import Y_UP
 from data_prep.public.nyu40 import ids_and_classes
-from data_prep.public.rooms import FoundRoom, FramedRoom, Reader, box_of, chosen_frames, sampled
+from data_prep.public.rooms import FoundRoom, FramedRoom, Reader, chosen_frames, corners_of, sampled
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
 from sceneprior.core.geometry.intrinsics import odd_field_of_view
@@ -177,7 +177,7 @@ def _read_boxes(path: Path) -> dict[int, np.ndarray]:
         half = np.abs(np.array(box.coeffs)) * _METRES
         if axes.shape == (3, 3) and np.isfinite(axes).all() and (half > 0).all():
             center = turn @ np.array(box.centroid) * _METRES
-            found[box.ID + 1] = box_of(center, axes @ turn.T, half)
+            found[box.ID + 1] = corners_of(center, axes @ turn.T, half)
     return found
 
 

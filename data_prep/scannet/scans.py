@@ -13,6 +13,7 @@ from data_prep.frames import (
     mask_intrinsics,
     room_cameras,
 )
+from data_prep.heading import turn_matrix
 from data_prep.scannet.annotations import (
     axis_alignment,
     object_parts,
@@ -88,6 +89,10 @@ class Scan:
     """(4, 2) x, z of the bounding rectangle of the objects."""
     height_m: float
     """Height of the scan's highest vertex above the floor."""
+    room_from_scan: np.ndarray
+    """(4, 4) float64, from the mesh's world."""
+    is_aligned: bool
+    """True if the scan has an axisAlignment."""
     frames: tuple[int, ...]
     """Frame number of each view."""
     world_to_camera: np.ndarray
@@ -104,25 +109,30 @@ class Scan:
         return self.folder.name
 
 
-def read_scan(folder: Path, labels: Labels, settings: ScanSettings | None = None) -> Scan:
+def read_scan(
+    folder: Path, labels: Labels, settings: ScanSettings | None = None, turned_deg: float = 0.0
+) -> Scan:
     """Read all of a scan except its pictures.
 
-    The room frame is that of axisAlignment, with (x, y, z) mapped to (y, z, x) so that y is up. The
-    floor, y = 0, is at the lowest point of the boxes of objects with a class; the origin is the
-    centre of their bounding rectangle in x and z. ScanNet has no floor plans, and its annotated
-    floors cover only the parts that the camera saw. If no object has a class, the box of the whole
-    mesh is used instead.
+    The room frame is that of axisAlignment, with (x, y, z) mapped to (y, z, x) so that y is up, and
+    then turned by `turned_deg` about y. The floor, y = 0, is at the lowest point of the boxes of
+    objects with a class; the origin is the centre of their bounding rectangle in x and z. ScanNet
+    has no floor plans, and its annotated floors cover only the parts that the camera saw. If no
+    object has a class, the box of the whole mesh is used instead.
     """
     folder, settings = Path(folder), settings or ScanSettings()
     name = folder.name
     properties_path = folder / f"{name}.txt"
     properties = read_properties(properties_path)
     aligned = Y_UP @ axis_alignment(properties_path, properties)
+    if turned_deg:
+        aligned = turn_matrix(turned_deg) @ aligned
     groups, notes = read_groups(folder / f"{name}.aggregation.json")
-    if "axisAlignment" not in properties:
+    is_aligned = "axisAlignment" in properties
+    if not is_aligned:
         notes.append(
-            f"{properties_path.name} has no axisAlignment: walls may stand at an angle to the axes "
-            "and boxes may be larger than their objects; ScanNet v2's file has one"
+            f"{properties_path.name} has no axisAlignment, which ScanNet v2's file has: the "
+            "direction of the walls is found from masks"
         )
     segments_path = folder / f"{name}_vh_clean_2.0.010000.segs.json"
     mesh_path = folder / f"{name}_vh_clean_2.ply"
@@ -177,6 +187,8 @@ def read_scan(folder: Path, labels: Labels, settings: ScanSettings | None = None
         mesh=mesh,
         floor_m=np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * half,
         height_m=float(whole[1][1] - origin[1]),
+        room_from_scan=room_from_scan,
+        is_aligned=is_aligned,
         frames=choice.frames,
         world_to_camera=world_to_camera,
         intrinsics=intrinsics,

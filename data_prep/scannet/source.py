@@ -1,7 +1,7 @@
 """Source for ScanNet: a scan is a room, and the frames of its recording are its views."""
 
 import functools
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -9,8 +9,9 @@ from data_prep.engine.plan import digest
 from data_prep.engine.selection import house_may_match, seeded_split, select
 from data_prep.engine.source import Expected, Line, PreparedRoom, RoomTask, Survey
 from data_prep.engine.workers import Run
+from data_prep.heading import find_turn, note_of_turn
 from data_prep.scannet.labels import LABEL_SET, Labels, read_labels
-from data_prep.scannet.scans import ScanSettings, read_scan
+from data_prep.scannet.scans import Scan, ScanSettings, read_scan
 from data_prep.scannet.splits import find_scans, space_of, split_scans
 from data_prep.scannet.views import prepare_scan
 from sceneprior.core.errors import InputError
@@ -88,12 +89,28 @@ class ScanNetSource:
     def prepare(self, task: RoomTask, renderer: Renderer | None) -> PreparedRoom | Line:
         """Read one scan and label its views."""
         labels = _labels(Path(self.labels), Path(self.labels).stat().st_mtime_ns)
-        scan = read_scan(Path(self.scans) / task.house, labels, self.scan_settings)
+        folder = Path(self.scans) / task.house
+        scan = read_scan(folder, labels, self.scan_settings)
         made = prepare_scan(scan)
+        if made is not None and not scan.is_aligned:
+            made = self._turned(scan, made, labels)
         if made is None:
             why = f"none of its {len(scan.frames)} views shows any object"
             return Line(task.room_id, task.house, "filtered", "no_view", why, notes=[*scan.notes])
         return made
+
+    def _turned(self, scan: Scan, made: PreparedRoom, labels: Labels) -> PreparedRoom:
+        """Prepare a scan again along its walls, if these do not lie along its axes."""
+        degrees = find_turn(made.views)
+        if degrees:
+            scan = read_scan(scan.folder, labels, self.scan_settings, degrees)
+            again = prepare_scan(scan)
+            assert again is not None, "it was prepared before"
+            world = scan.room_from_scan
+            made = replace(
+                again, views=replace(again.views, turned_deg=degrees, room_from_world=world)
+            )
+        return replace(made, notes=(*made.notes, *note_of_turn(degrees)))
 
     def _folders(self, only: str | None) -> list[Path]:
         chosen = [path for path in find_scans(self.scans) if house_may_match(only, path.name)]

@@ -1,6 +1,6 @@
 """Arrays of a room in a view shard: their types and shapes, checked as they are read."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -68,6 +68,16 @@ def read_arrays(
     if not ((read["object_class"] >= 0) & (read["object_class"] < classes)).all():
         raise ValueError(f"object_class is not below {classes}, the size of its label set")
     return read
+
+
+def read_turn(group: "h5py.Group") -> dict[str, Any]:
+    """Read the attributes of a room that preparing turned; empty for other rooms."""
+    if "turned_deg" not in group.attrs:
+        return {}
+    degrees, matrix = float(group.attrs["turned_deg"]), group.attrs["room_from_world"]
+    if matrix.shape != (4, 4) or not np.isfinite([degrees, *matrix.ravel()]).all():
+        raise ValueError(f"turned_deg {degrees} and room_from_world {matrix.shape} are no turn")
+    return {"turned_deg": degrees, "room_from_world": matrix}
 
 
 def checked_images(group: "h5py.Group", name: str = "instance_ids") -> "h5py.Dataset":

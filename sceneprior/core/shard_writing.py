@@ -42,6 +42,9 @@ def shard_bytes(
 def _write_room(group: "h5py.Group", views: RoomViews, truth: RoomGroundTruth | None) -> None:
     _write_text(group, "room_id", views.room_id)
     group.attrs["image_size"] = views.image_size
+    if views.turned_deg:
+        group.attrs["turned_deg"] = views.turned_deg
+        group.attrs["room_from_world"] = views.room_from_world
     _write_text(group, "sha256", room_checksum(views, truth))
     for name in VIEW_ARRAYS:
         group.create_dataset(name, data=getattr(views, name))
@@ -81,6 +84,8 @@ def room_checksum(views: RoomViews, truth: RoomGroundTruth | None) -> str:
     parts: dict[str, Any] = {"room_id": views.room_id, "image_size": size}
     parts |= {name: getattr(views, name) for name in VIEW_ARRAYS}
     parts |= _images(views)
+    if views.turned_deg:
+        parts |= {"turned_deg": views.turned_deg, "room_from_world": views.room_from_world}
     if truth is not None:
         parts |= {f"ground_truth/{name}": getattr(truth, name) for name in TRUTH_ARRAYS}
         parts |= {"model_ids": truth.model_ids, "height_m": float(truth.height_m)}

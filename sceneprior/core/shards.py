@@ -23,6 +23,7 @@ from sceneprior.core.shard_arrays import (
     known_ids,
     known_stuff,
     read_arrays,
+    read_turn,
     shape_of,
 )
 
@@ -78,6 +79,10 @@ class RoomViews(Sightings):
     """(T, h, w) uint8, index into `STUFF`: floor, walls, doors, windows and ceiling, thinned by
     `stuff_step`; 0 where an object or anything else is, or nothing is known. None if the source
     does not name them, or if the images were not read."""
+    turned_deg: float = 0.0
+    """Angle about +y by which preparing turned the room, so that its walls run along x and z."""
+    room_from_world: np.ndarray | None = None
+    """(4, 4) float64 rigid transform from the source's world, in metres; only of turned rooms."""
 
 
 @dataclass(frozen=True)
@@ -167,7 +172,7 @@ class Shard(contextlib.AbstractContextManager["Shard"]):
         with self._group(room_id) as group:
             height, width = (int(side) for side in group.attrs["image_size"])
             sizes = {"H": height, "W": width}
-            arrays = read_arrays(group, VIEW_ARRAYS, sizes, self._classes)
+            arrays: dict[str, Any] = read_arrays(group, VIEW_ARRAYS, sizes, self._classes)
             sizes |= dict(zip("hw", stuff_size((height, width)), strict=True))
             read: dict[str, Any] = {"stuff": None}
             for name, check in (("instance_ids", known_ids), ("stuff", known_stuff)):
@@ -177,6 +182,7 @@ class Shard(contextlib.AbstractContextManager["Shard"]):
                 if stored.shape != (shape := shape_of(IMAGES[name], sizes)):
                     raise ValueError(f"{name} has shape {stored.shape}, expected {shape}")
                 read[name] = check(group, stored[()]) if images else None
+            arrays |= read_turn(group)
         return RoomViews(room_id=room_id, image_size=(height, width), **read, **arrays)
 
     def read_instance_ids(self, room_id: str, views: Sequence[int], step: int = 1) -> np.ndarray:

@@ -254,6 +254,7 @@ def test_folders(tmp_path):
 
 def test_a_checksum_covers_everything_and_survives_the_file(tmp_path):
     room, truth = with_stuff(make_room()), make_truth()
+    room = replace(room, turned_deg=12.5, room_from_world=np.eye(4))
     write_shard(tmp_path / "a.h5", "front3d_bedroom", [(room, truth), (make_room("bare"), None)])
     with Shard(tmp_path / "a.h5") as shard:
         assert shard.has_ground_truth("house_A") and not shard.has_ground_truth("bare")
@@ -269,9 +270,9 @@ def test_a_checksum_covers_everything_and_survives_the_file(tmp_path):
                 other = value.copy()
                 other.flat[-1] = other.flat[-1] == 0
             else:
-                other = {"room_id": "b", "image_size": (16, 12), "height_m": 3.0}.get(
-                    item.name, ("a", "b", "c")
-                )
+                other = {
+                    "room_id": "b", "image_size": (16, 12), "height_m": 3.0, "turned_deg": 9.0,
+                }.get(item.name, ("a", "b", "c"))  # fmt: skip
             both = [room, truth]
             both[pair] = replace(of, **{item.name: other})
             assert room_checksum(*both) != stored, item.name
@@ -361,3 +362,24 @@ def test_attributes_of_another_format_name_the_file(tmp_path):
             file[group].attrs[name] = value
         with pytest.raises(ShardError, match=r"a\.h5 (cannot be read|says format)"):
             Shard(path)
+
+
+def test_the_turn_of_a_room_is_an_attribute_of_turned_rooms_only(tmp_path):
+    path, matrix = tmp_path / "a.h5", np.eye(4)
+    matrix[:3, 3] = 0.1, 0.2, 0.3
+    room = make_room()
+    turned = replace(room, room_id="turned", turned_deg=-33.25, room_from_world=matrix)
+    write_shard(path, "front3d_bedroom", [(room, None), (turned, None)])
+    assert room_checksum(turned, None) != room_checksum(replace(turned, turned_deg=1.0), None)
+    with Shard(path) as shard:
+        assert_same(shard.read_room("turned", images=True), turned)
+        read = shard.read_room("turned", images=True)
+        assert shard.read_checksum("turned") == room_checksum(read, None)
+    with h5py.File(path, "a") as file:
+        assert set(file["rooms/house_A"].attrs) == {"room_id", "image_size", "sha256"}
+        file["rooms/turned"].attrs["room_from_world"] = np.full((4, 4), np.nan)
+    message = (
+        r"room turned cannot be read \(turned_deg -33\.25 and room_from_world .* are no turn\)"
+    )
+    with Shard(path) as shard, pytest.raises(ShardError, match=message):
+        shard.read_room("turned")

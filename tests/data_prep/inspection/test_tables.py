@@ -1,14 +1,21 @@
 """The sheet, the counts and the command around them."""
 
+import re
 import shutil
 
 import h5py
+import numpy as np
 import pytest
 from front_jobs import six_bedrooms_shards
 from PIL import Image
+from posed_files import SET, PosedRoom
 
+from data_prep.engine.build import Job, build_shards
 from data_prep.inspection.pictures import draw_sheet
+from data_prep.inspection.tables import count_tables, room_table
+from data_prep.posed.source import PosedSource
 from sceneprior.core.errors import InputError
+from sceneprior.core.geometry.turns import yaw_rotation
 
 
 @pytest.fixture
@@ -79,3 +86,22 @@ def test_verify_says_what_it_could_not_check(shards, cli):
     assert said.endswith(
         "wrong focal lengths (0 measurements to spare; too few views show whole objects)."
     )
+
+
+def test_tables_say_how_far_rooms_were_turned(tmp_path):
+    room = PosedRoom(tmp_path / "rooms" / "attic", size=(192, 256), focal_px=160.0)
+    for eye in [(-2.5, 0.1, 1.5), (2.5, 0.3, 1.6), (0.1, 2.6, 1.4), (1.6, -2.4, 1.7)]:
+        room.look(eye, (0.1, 0.1, 0.3))
+    room.write()
+    turn = np.eye(4)
+    turn[:2, :2] = yaw_rotation(np.radians(20.0))[::2, ::2]
+    room.poses = [turn @ pose for pose in room.poses]
+    room.write_transforms(room.data)
+    build_shards(Job(PosedSource(room.folder, SET), tmp_path / "shards"))
+    (caption,) = (table.caption for table in count_tables(tmp_path / "shards") if table.caption)
+    assert re.fullmatch(
+        r"1 rooms were turned to lie along their walls and furniture, by (\S+) to \1 degrees\.",
+        caption,
+    )
+    title = room_table(tmp_path / "shards", "attic").title
+    assert re.fullmatch(r"attic \(turned by -?[12]\d\.\d\d degrees\)", title)

@@ -13,6 +13,7 @@ from data_prep.posed.transforms import read_recording
 from data_prep.posed.views import PosedSettings
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
+from sceneprior.core.geometry.turns import quarter_rotation, yaw_rotation
 
 
 @pytest.fixture
@@ -256,3 +257,39 @@ def test_the_axis_that_seems_up(room):
     room.poses = [np.full((4, 4), np.nan)]
     room.write()
     assert seems_up(read_recording(room.folder)) is None
+
+
+@pytest.mark.parametrize("degrees", [33.0, -57.0, 123.0])
+@pytest.mark.parametrize("keys", [{}, {"floor_m": 0.0, "floor_center_m": (0.1, -0.2)}])
+def test_a_capture_with_any_heading_is_the_same_room(room, degrees, keys):
+    """The world of the poses is turned about its z axis: the room is the same, up to quarters."""
+    for eye in [(-2.5, 0.1, 1.5), (2.5, 0.3, 1.6), (0.1, 2.6, 1.4), (1.6, -2.4, 1.7)]:
+        room.look(eye, (0.1, 0.1, 0.3))
+    room.size, room.focal_px = (192, 256), 160.0
+    plain = prepared(room.write(**keys))
+    assert plain.views.turned_deg == 0 and plain.views.room_from_world is None
+    assert not any("turned" in note for note in plain.notes)
+    exact = np.array(plain.cameras["room_from_world"])[:3, :3]
+    assert np.isin(exact, (0, 1, -1)).all()  # not even by last bits
+    turn = np.eye(4)
+    turn[:2, :2] = yaw_rotation(np.radians(degrees))[::2, ::2]
+    room.poses = [turn @ pose for pose in room.poses]
+    if "floor_center_m" in keys:
+        center = turn[:2, :2] @ keys["floor_center_m"]
+        keys = keys | {"floor_center_m": center.tolist()}
+    room.write_transforms(room.data | keys)  # the masks are those of before
+    made = prepared(room)
+    views = made.views
+    assert -45 <= views.turned_deg <= 45 and abs(views.turned_deg) > 1
+    assert f"turned by {views.turned_deg:.2f} degrees, along its walls" in " ".join(made.notes)
+    np.testing.assert_array_equal(views.instance_ids, plain.views.instance_ids)
+    np.testing.assert_allclose(views.room_from_world, made.cameras["room_from_world"], atol=1e-8)
+    # The file's poses, mapped by the shard's matrix, are the room's cameras.
+    mapped = views.room_from_world @ np.array(room.poses) @ np.diag([1.0, -1, -1, 1])
+    here = np.linalg.inv(views.world_to_camera.astype(float))
+    np.testing.assert_allclose(mapped, here, atol=1e-5)
+    quarters = [quarter_rotation(k) for k in range(4)]
+    there = np.linalg.inv(plain.views.world_to_camera.astype(float))[:, :3, 3]
+    apart = [np.abs(here[:, :3, 3] - there @ quarter.T).max() for quarter in quarters]
+    # 0.3 degrees at 3 m; and the middle of the cameras' bounding box moves a little, too.
+    assert min(apart) < 0.03

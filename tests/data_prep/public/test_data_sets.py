@@ -1,6 +1,7 @@
 """Rooms of every public data set, from its files to shards: classes, masks, cameras, boxes."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -19,10 +20,14 @@ from public_files import (
 )
 
 from data_prep.engine.workers import pool
+from data_prep.frames import GL_TO_CV, Y_UP
+from data_prep.heading import turn_matrix
 from data_prep.inspection.projection import boxes_around, hull_of
+from data_prep.public.rooms import FramedRoom, prepare_room
 from data_prep.public.source import PublicSource, open_reader
 from data_prep.upright import own_sides
 from sceneprior.core.classes import label_set
+from sceneprior.core.geometry.turns import quarter_rotation
 from sceneprior.core.ground_truth import reference_scenes
 
 NAMES = label_set("scannet")
@@ -179,3 +184,42 @@ def test_the_commands_of_public_data_md_write_shards_that_verify(room, tmp_path,
     for name in ("hypersim", "structured3d", "scannetpp"):
         for scene in reference_scenes(Path("out") / name / "shards", "train"):
             assert [item.label for item in scene.objects] == ["bed", "chair"]
+
+
+@pytest.mark.parametrize("degrees", [30.0, -75.0])
+def test_rooms_at_an_angle_are_turned_with_their_boxes_and_floors(room, degrees):
+    """The world of a room is turned about y: ground truth and cameras are those of the plain room,
+    up to quarter turns."""
+    room.size, room.focal_px = (192, 256), 160.0
+    for eye in [(-2.5, 0.1, 1.5), (2.5, 0.3, 1.6), (0.1, 2.6, 1.4), (1.6, -2.4, 1.7)]:
+        room.look(eye, (0.1, 0.1, 0.3))
+    plain = FramedRoom(
+        np.stack([room.ids(k) for k in range(9)]).astype(np.int32),
+        {3: "bed", 300: "chair", 7: "pillow", 11: "floor", 12: "wall"},
+        Y_UP @ np.stack(room.poses) @ GL_TO_CV,
+        np.array([[160.0, 0, 128], [0, 160, 96], [0, 0, 1]]),
+        {thing.id: thing.corners @ Y_UP[:3, :3].T for thing in room.things[:3]},
+        floor_m=np.array([(-3.0, -3), (3, -3), (3, 3.1), (-3, 3.1)]),
+    )
+    turn = turn_matrix(degrees)
+    turned = replace(
+        plain,
+        camera_to_world=turn @ plain.camera_to_world,
+        boxes={k: points @ turn[:3, :3].T for k, points in plain.boxes.items()},
+        floor_m=plain.floor_m @ turn[::2, ::2][:2, :2].T,
+    )
+    one, other = (prepare_room("a", framed, "scannet") for framed in (plain, turned))
+    assert one.views.turned_deg == 0 and one.views.room_from_world is None
+    views, truth = other.views, other.truth
+    assert abs((views.turned_deg + degrees + 45) % 90 - 45) < 0.5
+    assert f"turned by {views.turned_deg:.2f} degrees, along its walls" in other.notes[-1]
+    quarter = quarter_rotation(round((views.turned_deg + degrees) / 90))
+    slack = 0.05  # 0.5 degrees at 4 m
+    np.testing.assert_allclose(truth.centers_m, one.truth.centers_m @ quarter.T, atol=slack)
+    np.testing.assert_allclose(truth.sizes_m, one.truth.sizes_m @ abs(quarter).T, atol=slack)
+    level = quarter[::2, ::2]
+    np.testing.assert_allclose(truth.floor_m, one.truth.floor_m @ level.T, atol=slack)
+    mapped = views.room_from_world @ turned.camera_to_world
+    np.testing.assert_allclose(
+        mapped, np.linalg.inv(views.world_to_camera.astype(float)), atol=1e-5
+    )

@@ -140,3 +140,30 @@ def test_shifted_instance_ids_are_named(checked, by):
         "the instance ids of the masks seem to be those of other objects; with ids exchanged"
         in (checked(shift).problems[-1])
     )
+
+
+def test_a_scan_without_alignment_is_turned_along_its_furniture(right, tmp_path):
+    """Its boxes are those of the aligned scan, up to quarter turns, and --verify agrees."""
+    scan, table = right
+    folder = tmp_path / "scans" / scan.folder.name
+    shutil.copytree(scan.folder, folder)
+    (folder / f"{folder.name}.txt").write_text("sceneType = Bedroom / Hotel\n")
+    source = ScanNetSource(tmp_path / "scans", table, ScanSettings(frame_step=1))
+    build_shards(Job(source, tmp_path / "shards"))
+    assert verify(tmp_path / "shards").problems == ()
+    (path,) = (tmp_path / "shards").glob("*/*.h5")
+    with Shard(path) as shard:
+        views, truth = (read("scene0000_00") for read in (shard.read_room, shard.read_ground_truth))
+    # 0.6 rad, or 34.4 degrees, about z.
+    assert min(abs(views.turned_deg - angle) for angle in (34.38, 34.38 - 90)) < 0.5
+    aligned = prepare_scan(read_scan(scan.folder, read_labels(table), source.scan_settings)).truth
+    np.testing.assert_array_equal(truth.object_class, aligned.object_class)
+    sizes, wanted = truth.sizes_m, aligned.sizes_m
+    apart = [np.abs(sizes[:, order] - wanted).max() for order in ((0, 1, 2), (2, 1, 0))]
+    assert min(apart) < 0.05  # 0.5 degrees of 2 m, twice; unturned, they are 1 m too large
+    (folder / f"{folder.name}.txt").write_text("axisAlignment = 1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1\n")
+    trusted = ScanNetSource(tmp_path / "scans", table, source.scan_settings)
+    build_shards(Job(trusted, tmp_path / "trusted"))
+    (path,) = (tmp_path / "trusted").glob("*/*.h5")
+    with Shard(path) as shard:
+        assert shard.read_room("scene0000_00").turned_deg == 0

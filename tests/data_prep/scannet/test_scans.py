@@ -165,4 +165,4 @@ def test_a_scan_without_an_alignment_says_so(scan, labels):
     assert not any("axisAlignment" in note for note in read_scan(scan.folder, labels).notes)
     scan.path(".txt").write_text("sceneType = Bedroom / Hotel\n")
     (note,) = (n for n in read_scan(scan.folder, labels).notes if "axisAlignment" in n)
-    assert note.startswith("scene0000_00.txt has no axisAlignment: walls may stand at an angle")
+    assert note.startswith("scene0000_00.txt has no axisAlignment, which ScanNet v2's")

@@ -1,0 +1,178 @@
+"""Finds the direction of a room's walls and furniture from images of ids, and turns the room by it.
+
+Most edges of walls and furniture are vertical, or run along one of two horizontal directions at
+right angles. The edge of a mask and the camera's centre span a plane, which holds one horizontal
+direction only. So each pixel of an outline votes for that direction, modulo 90 degrees, and the
+most frequent direction is the room's. Depths, the floor and 3D boxes are not needed.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int, Integer
+from scipy import ndimage
+
+from sceneprior.core.geometry.turns import yaw_rotation
+from sceneprior.core.shards import RoomViews, stuff_step, thinned, thinned_intrinsics
+
+ALIGNED_DEG = 1.0
+"""A room whose direction is at most this far from an axis is not turned."""
+SECOND = 0.7
+"""Highest share of the votes of the first direction that a second one may have."""
+AGREE_DEG = 2.0
+"""Largest difference between the direction found in all views and that in either half of them."""
+_SIDE_PX = 480
+"""Approximate longer side of the images whose outlines are used."""
+_VIEWS = 60
+"""Maximum number of views that are used, spread evenly."""
+_SMOOTH_PX = 4.0
+"""Standard deviation of the Gaussian that smooths a mask before its outline's direction is taken.
+"""
+_LEAST_SLOPE = 0.1
+"""Least share of the up axis in the unit normal of the plane of an edge, which may otherwise be a
+vertical edge."""
+_MOST_CHANGE = 4.0
+"""Change of the direction with that of the edge in the image above which an edge is not used: a
+direction cannot be seen from its own height."""
+_BINS, _WIDTH_DEG, _NEAR_DEG, _APART_DEG = 360, 0.75, 2.0, 5.0
+"""Bins of a quarter turn; standard deviation by which votes are spread; largest distance of votes
+that are averaged; smallest distance of a second direction."""
+_QUARTER = np.pi / 2
+
+
+class _Votes(NamedTuple):
+    """Directions, as yaws about +y, for which the pixels of outlines vote."""
+
+    yaw_rad: Float[np.ndarray, " votes"]
+    weight: Float[np.ndarray, " votes"]
+    view: Int[np.ndarray, " votes"]
+
+    def half(self, which: int) -> "_Votes":
+        """Votes of every other view."""
+        return _Votes(*(part[self.view % 2 == which] for part in self))
+
+
+def find_turn(views: RoomViews) -> float | None:
+    """Find the angle in degrees by which a room must turn about +y, so that most of its edges run
+    along x and z: from -45 to 45, 0 for a room that is aligned to `ALIGNED_DEG`.
+
+    The room was read with its images, and y points up. None if no direction is found with
+    confidence: too few edges, two directions, or other directions in other views. The angle is
+    rounded to 0.01 degrees, so that it does not depend on the last bits of sums.
+    """
+    votes = _votes_of_room(views)
+    whole, *halves = (_most_voted(part) for part in (votes, votes.half(0), votes.half(1)))
+    if whole is None or whole.second > SECOND:
+        return None
+    for half in halves:
+        if half is None or abs(_folded(half.yaw_rad - whole.yaw_rad)) > np.radians(AGREE_DEG):
+            return None
+    degrees = round(float(-np.degrees(_folded(whole.yaw_rad))), 2)
+    return degrees if abs(degrees) > ALIGNED_DEG else 0.0
+
+
+def turn_matrix(degrees: float) -> Float[np.ndarray, "4 4"]:
+    """Rigid transform that turns a world about +y."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = yaw_rotation(np.radians(degrees))
+    return matrix
+
+
+def note_of_turn(degrees: float | None) -> list[str]:
+    """Note for the report on the result of `find_turn`; none for a room that is aligned."""
+    if degrees is None:
+        return ["no direction of walls or furniture is found, so the room is not turned"]
+    return [f"turned by {degrees:.2f} degrees, along its walls and furniture"] if degrees else []
+
+
+def _folded(yaw_rad: Any) -> Any:
+    """The angle from -45 to 45 degrees that differs by whole quarter turns."""
+    return (yaw_rad + _QUARTER / 2) % _QUARTER - _QUARTER / 2
+
+
+def _votes_of_room(views: RoomViews) -> _Votes:
+    """Votes of the outlines of objects, void included, and of stuff, in evenly spread views."""
+    assert views.instance_ids is not None, "read with images"
+    count = len(views.world_to_camera)
+    rows = np.unique(np.linspace(0, count - 1, min(count, _VIEWS)).round().astype(int))
+    step = max(1, round(max(views.image_size) / _SIDE_PX))
+    layers = [(views.instance_ids[(..., *thinned(step))], step)]
+    if views.stuff is not None:
+        layers.append((views.stuff, stuff_step(views.image_size)))
+    found = [
+        _votes_of_image(images[row], views.world_to_camera[row], K[row], place)
+        for images, step in layers
+        for K in [thinned_intrinsics(views.intrinsics, step)]
+        for place, row in enumerate(rows)
+    ]
+    return _Votes(*(np.concatenate(part) for part in zip(*found, strict=True)))
+
+
+def _votes_of_image(
+    image: Integer[np.ndarray, "height width"],
+    world_to_camera: Float[np.ndarray, "4 4"],
+    intrinsics: Float[np.ndarray, "3 3"],
+    view: int,
+) -> _Votes:
+    """Votes of the outlines in one image of ids.
+
+    An edge through (u, v) with the normal (g, h) in the image lies in the plane through the camera
+    whose normal is N = R^T K^T (g, h, -g u - h v). The horizontal directions in this plane and
+    across it, cross(N, y) and (N_x, 0, N_z), are at right angles, so the yaw of the second is voted
+    for.
+    """
+    height, width = image.shape
+    margin = int(3 * _SMOOTH_PX)
+    to_world = intrinsics.astype(np.float64) @ world_to_camera[:3, :3].astype(np.float64)
+    parts = [np.zeros((2, 0))]
+    for label, place in enumerate(ndimage.find_objects(image), start=1):
+        if place is None:
+            continue
+        rows, columns = (slice(max(0, side.start - margin), side.stop + margin) for side in place)
+        mask = image[rows, columns] == label
+        y, x = np.nonzero(mask & ~ndimage.binary_erosion(mask, border_value=1))
+        soft = mask.astype(np.float32)
+        g, h = (
+            ndimage.gaussian_filter(soft, _SMOOTH_PX, order, mode="nearest", truncate=3)[y, x]
+            for order in ((0, 1), (1, 0))
+        )
+        u, v = x + columns.start + 0.5, y + rows.start + 0.5
+        # The image's border is no edge; and where a mask is narrow, its two sides blur into one.
+        inner = (np.minimum(u, width - u) > margin) & (np.minimum(v, height - v) > margin)
+        inner &= np.hypot(g, h) > 0.5 / (_SMOOTH_PX * np.sqrt(2 * np.pi))
+        g, h, u, v = (values[inner].astype(np.float64) for values in (g, h, u, v))
+        normal = np.stack([g, h, -g * u - h * v], axis=1) @ to_world
+        # The change of the normal as the edge is turned about its pixel.
+        change = np.stack([-h, g, h * u - g * v], axis=1) @ to_world
+        level = np.maximum(normal[:, 0] ** 2 + normal[:, 2] ** 2, 1e-12)
+        speed = np.abs(change[:, 0] * normal[:, 2] - change[:, 2] * normal[:, 0]) / level
+        sloping = np.abs(normal[:, 1]) > _LEAST_SLOPE * np.linalg.norm(normal, axis=1)
+        used = sloping & (speed < _MOST_CHANGE)
+        yaw_rad = np.arctan2(normal[used, 0], normal[used, 2])
+        parts.append(np.stack([yaw_rad, 1 / (1 + speed[used] ** 2)]))
+    yaw_rad, weight = np.concatenate(parts, axis=1)
+    return _Votes(yaw_rad, weight, np.full(len(weight), view))
+
+
+class _Direction(NamedTuple):
+    """The most frequent direction, and the share of its votes that a second one has."""
+
+    yaw_rad: float
+    second: float
+
+
+def _most_voted(votes: _Votes) -> _Direction | None:
+    """Find the direction with most votes near it, and average these; None without votes."""
+    if not len(votes.weight):
+        return None
+    bins = np.floor(votes.yaw_rad % _QUARTER * (_BINS / _QUARTER)).astype(np.int64) % _BINS
+    counts = np.bincount(bins, votes.weight, _BINS)
+    smooth = ndimage.gaussian_filter1d(counts, _WIDTH_DEG * _BINS / 90, mode="wrap")
+    top = int(smooth.argmax())
+    yaw_rad = (top + 0.5) * _QUARTER / _BINS
+    apart = np.abs(_folded((np.arange(_BINS) - top) * (_QUARTER / _BINS))) > np.radians(_APART_DEG)
+    for _ in range(5):
+        off = _folded(votes.yaw_rad - yaw_rad)
+        near = np.abs(off) < np.radians(_NEAR_DEG)
+        yaw_rad += float(np.average(off[near], weights=votes.weight[near]))
+    return _Direction(yaw_rad, float(smooth[apart].max() / smooth[top]))
