@@ -22,6 +22,9 @@ from sceneprior.lifted.sampler.violations import settled, violation
 
 TRIES = 4
 """Number of places drawn for an object in each particle; the first allowed one is taken."""
+SIZE_RANGE = 0.35
+"""Largest difference between the log extents of an object and of its look. The limit is tighter
+than without a request: in a small room, the particles with the smallest objects survive."""
 LOW_M = 0.15
 ON_FLOOR = 0.75
 """Probability of a bottom below `LOW_M` above which an object is set on the floor: in a small room,
@@ -63,7 +66,7 @@ def place_next(
         hanging: Indices of `HANGING`.
         rejections: Counts to which rejected places are added.
     """
-    chance = np.concatenate([each.random((PARTICLES, 5 + 4 * TRIES)) for each in draws])
+    chance = np.concatenate([each.random((PARTICLES, 7 + 4 * TRIES)) for each in draws])
     going = particles.alive & (particles.upcoming[:, step] != 0).numpy()
     rows = torch.from_numpy(np.flatnonzero(going))
     if not len(rows):
@@ -102,11 +105,13 @@ def _propose(
     reading = particles.read(sampler, rows, step)
     numbers = torch.from_numpy(chance)[rows].float()
     look = draw_index(sampler.look_logits(reading, label), numbers[:, 0])
-    size_m = sampler.draw_size(look, numbers[:, 1])
-    bottoms = sampler.bottom(reading, label, look, size_m)
-    bottom_m = bottoms.draw(numbers[:, 2], numbers[:, 3:4])[:, 0].clamp(min=0)
-    low = bottoms.weight_logits.softmax(dim=-1) * (bottoms.means[..., 0] < LOW_M)
-    bottom_m = bottom_m.masked_fill((low.sum(dim=-1) > ON_FLOOR) & (bottom_m > LOW_M), 0.0)
+    mixture = sampler.details(reading, label, look)
+    details = mixture.draw(numbers[:, 1], numbers[:, 2:6])
+    off = details[:, :3].clamp(-SIZE_RANGE, SIZE_RANGE)
+    size_m = (sampler.look_shown[look, -3:] + off).exp()
+    low = mixture.weight_logits.softmax(dim=-1) * (mixture.means[..., 3] < LOW_M)
+    on_floor = (low.sum(dim=-1) > ON_FLOOR) & (details[:, 3] > LOW_M)
+    bottom_m = details[:, 3].clamp(min=0).masked_fill(on_floor, 0.0)
     shapes = [particles.plan(row).shape for row in rows.tolist()]
     for at, shape in enumerate(shapes):
         if shape.ceiling_m is not None:
@@ -114,7 +119,7 @@ def _propose(
             hangs = int(label[at]) in hanging
             bottom_m[at] = highest_m if hangs else min(float(bottom_m[at]), highest_m)
     rectangle_m = torch.stack([
-        torch.from_numpy(_rectangle(shape.rectangles_m, size_m[at, ::2].numpy(), chance[row, 4]))
+        torch.from_numpy(_rectangle(shape.rectangles_m, size_m[at, ::2].numpy(), chance[row, 6]))
         for at, (row, shape) in enumerate(zip(rows.tolist(), shapes, strict=True))
     ]).float()  # fmt: skip
     reading = reading._replace(frame=Frame.plain(rectangle_m))
@@ -144,7 +149,7 @@ def _draw_places(
 ) -> list[int]:
     """Place each object at the first allowed place of `TRIES` drawn ones, and return the rows of
     `found` without one."""
-    numbers = torch.from_numpy(chance[found.rows.numpy(), 5:]).float().unflatten(1, (TRIES, 4))
+    numbers = torch.from_numpy(chance[found.rows.numpy(), 7:]).float().unflatten(1, (TRIES, 4))
     x = found.places.draw_x(numbers[..., :2])
     waiting = torch.arange(len(found.rows))
     for number in range(TRIES):

@@ -1,8 +1,8 @@
 """Sizes that repeat: clusters of the training objects' extents, for each prototype.
 
-Real furniture repeats a limited number of models, and lifted boxes of the same model differ by a few
-per cent. Objects of one prototype with similar extents are one entry, with their median extents and
-their number. An entry is a size alone: it says nothing of the rooms in which it was found.
+Real furniture repeats a limited number of models, and lifted boxes of the same model differ by a
+few per cent. Objects of one prototype with similar extents are one entry, with their median extents
+and their number. An entry is a size alone: it says nothing of the rooms in which it was found.
 """
 
 import numpy as np
