@@ -34,10 +34,9 @@ LOOKS = 16
 OPEN_M = 3 * FRAME_M
 """Distance in metres beyond which a side counts as empty: 1 of 370 sides in the training rooms
 exceeds it."""
-SIZE_RANGE = 0.5
-"""Largest difference between the log extents of an object and of its look."""
 SIZE_DOUBT = 0.1
-"""Standard deviation of that difference for given objects."""
+"""Standard deviation of the difference between the log extents of a given object and of its
+look."""
 ROUNDS = 16
 """Maximum number of attempts to furnish a room before it is planned anew."""
 PLANS = 3
@@ -71,7 +70,7 @@ def draw_rooms(
         last = number + 1 == PLANS * ROUNDS
         if number % ROUNDS == 0:
             plan = plan_rooms(sampler, given, count, (seed, number // ROUNDS))
-        numbers = uniform_numbers(count, slots * (7 + 4 * PLACES), (seed, PLANS + number))
+        numbers = uniform_numbers(count, slots * (5 + 4 * PLACES), (seed, PLANS + number))
         numbers = numbers.unflatten(1, (slots, -1))
         rectangle_m[waiting] = plan.rectangle_m[waiting]
         stuck = []
@@ -164,12 +163,11 @@ def _placed(
     one, at the place with the least violation.
     """
     look = draw_index(sampler.look_logits(reading, label), chance[:, 1])
-    details = sampler.details(reading, label, look).draw(chance[:, 2], chance[:, 3:7])
-    off = details[:, :3].clamp(-SIZE_RANGE, SIZE_RANGE)
-    size_m = (sampler.look_shown[look, -3:] + off).exp()
-    bottom_m = details[:, 3].clamp(min=0)  # the floor
+    size_m = sampler.draw_size(look, chance[:, 2])
+    bottoms = sampler.bottom(reading, label, look, size_m)
+    bottom_m = bottoms.draw(chance[:, 3], chance[:, 4:5])[:, 0].clamp(min=0)  # the floor
     places = sampler.place(reading, label, look, size_m, bottom_m)
-    numbers = chance[:, 7:].unflatten(1, (PLACES, 4))[:, :tries]
+    numbers = chance[:, 5:].unflatten(1, (PLACES, 4))[:, :tries]
     x = places.draw_x(numbers[..., :2])
     centre_m = torch.stack([x[:, 0], bottom_m + size_m[:, 1] / 2, x[:, 0]], dim=-1)
     boxes_m = torch.cat([centre_m, size_m], dim=-1)

@@ -17,6 +17,7 @@ from sceneprior.lifted.sampler.places import Places
 from sceneprior.lifted.sampler.reading import LENGTHS, Frame, Reading, lengths_shown
 from sceneprior.lifted.sampler.rooms import SYMMETRIES, gaps_m, rectangle_sides
 from sceneprior.lifted.sampler.settings import SamplerConfig
+from sceneprior.lifted.sampler.sizes import SIZES
 from sceneprior.paper.layers import mlp
 
 CLASS_WIDTH = 32
@@ -69,6 +70,8 @@ class RoomSampler(nn.Module):
     backs: Tensor
     fronts: Tensor
     front_confidence: Tensor
+    sizes_m: Tensor
+    size_counts: Tensor
 
     def __init__(self, settings: SamplerConfig, classes: int, prototypes: int, max_objects: int):
         super().__init__()
@@ -86,6 +89,8 @@ class RoomSampler(nn.Module):
         self.register_buffer("backs", torch.zeros(prototypes, dtype=torch.int64))
         self.register_buffer("fronts", torch.zeros(prototypes, dtype=torch.int64))
         self.register_buffer("front_confidence", torch.zeros(prototypes))
+        self.register_buffer("sizes_m", torch.ones(prototypes, SIZES, 3))
+        self.register_buffer("size_counts", torch.zeros(prototypes, SIZES))
         # Contents and places overfit first: they get twice the dropout, at most 0.5.
         self.contents = Contents(classes, width // 2, min(2 * dropout, 0.5))
         self.class_embedding = nn.Embedding(classes, CLASS_WIDTH)
@@ -196,6 +201,27 @@ class RoomSampler(nn.Module):
         """Joint distribution of the object's log extents, relative to those of its look, and of the
         height of its bottom."""
         return LogisticMixture.of(self.details_head(self._known(reading, label, look)), 4)
+
+    def draw_size(
+        self, look: Int[Tensor, " rooms"], uniform: Float[Tensor, " rooms"]
+    ) -> Float[Tensor, "rooms 3"]:
+        """Sample the extents of objects with these looks, in proportion to the numbers of training
+        objects with them (`find_sizes`)."""
+        prototype = look // POSES
+        which = draw_index(self.size_counts[prototype].log(), uniform)
+        size_m = self.sizes_m[prototype, which]
+        return size_m.flip(-1).where(look.unsqueeze(-1) % 2 == 1, size_m)
+
+    def bottom(
+        self,
+        reading: Reading,
+        label: Int[Tensor, " rooms"],
+        look: Int[Tensor, " rooms"],
+        size_m: Float[Tensor, "rooms 3"],
+    ) -> LogisticMixture:
+        """Distribution of the height of the object's bottom, given its size."""
+        off = size_m.log() - self.look_shown[look, -3:]
+        return self.details(reading, label, look).given(off)
 
     def place(
         self,

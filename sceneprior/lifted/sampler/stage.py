@@ -20,6 +20,7 @@ from sceneprior.lifted.sampler.likelihood import negative_log_likelihood
 from sceneprior.lifted.sampler.network import RECTANGLES, RoomSampler
 from sceneprior.lifted.sampler.rooms import SYMMETRIES, SamplerRooms, frames_of, turned_rooms
 from sceneprior.lifted.sampler.settings import SamplerConfig
+from sceneprior.lifted.sampler.sizes import find_sizes
 from sceneprior.paper.losses.averages import share_of_batch
 from sceneprior.paper.prior import ScenePrior
 from sceneprior.training.steps import (
@@ -144,7 +145,7 @@ class SamplerStage(lightning.LightningModule):
 def teach(sampler: RoomSampler, rooms: SamplerRooms) -> None:
     """Set the buffers of a fresh sampler from the training rooms: the encodings of looks, the
     mixture of rectangles, the classes that may be sampled, the pairs of classes that may intersect,
-    mean footprints, and the backs and fronts of prototypes."""
+    mean footprints, and the sizes, backs and fronts of prototypes."""
     prototypes = rooms.prototypes
     looks = torch.from_numpy(prototypes.shown())
     sampler.look_shown[: len(looks)] = looks
@@ -157,6 +158,9 @@ def teach(sampler: RoomSampler, rooms: SamplerRooms) -> None:
     areas_m2 = rooms.rooms.boxes_m[here][:, [3, 5]].prod(dim=-1)
     labels = rooms.rooms.object_class[here]
     sampler.footprints_m2.scatter_reduce_(0, labels, areas_m2, "mean", include_self=False)
+    sizes_m, numbers = find_sizes(rooms.rooms, prototypes, len(sampler.backs))
+    sampler.sizes_m.copy_(sizes_m)
+    sampler.size_counts.copy_(numbers)
     sampler.backs.copy_(find_backs(rooms.rooms, len(sampler.backs)))
     fronts, confidence = find_fronts(rooms.rooms, prototypes, len(sampler.fronts))
     sampler.fronts.copy_(fronts)

@@ -1,0 +1,116 @@
+"""Sizes that repeat: clusters found by a plain loop, and draws in proportion to their numbers."""
+
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+import torch
+from rooms_of_boxes import PROTOTYPES, sampler_rooms, small_sampler
+from torch.testing import assert_close
+
+from sceneprior.lifted.prototypes import POSES
+from sceneprior.lifted.sampler import sizes as module
+from sceneprior.lifted.sampler.draw import draw_rooms
+from sceneprior.lifted.sampler.rooms import SamplerRooms, turned_rooms
+from sceneprior.lifted.sampler.sizes import COMMON, SAME_SIZE, SIZES, find_sizes
+
+
+@pytest.fixture(scope="module")
+def rooms() -> SamplerRooms:
+    """Rooms of 40 pieces whose extents vary by up to a quarter."""
+    rooms = sampler_rooms(40)
+    scale = torch.from_numpy(np.random.default_rng(3).uniform(0.8, 1.25, (40, 1, 3))).float()
+    sizes_m = rooms.rooms.boxes_m[..., 3:] * scale
+    rooms.rooms = replace(
+        rooms.rooms, boxes_m=torch.cat([rooms.rooms.boxes_m[..., :3], sizes_m], dim=-1)
+    )
+    return rooms
+
+
+def complete_linkage(own_m: list[np.ndarray]) -> list[list[np.ndarray]]:
+    """Join the two clusters whose farthest members are nearest, until none are within
+    `SAME_SIZE`."""
+    clusters = [[each] for each in own_m]
+
+    def apart(pair: tuple[int, int]) -> float:
+        first, second = (clusters[each] for each in pair)
+        return max(np.abs(np.log(a) - np.log(b)).max() for a in first for b in second)
+
+    while len(clusters) > 1:
+        pair = min(combinations(range(len(clusters)), 2), key=apart)
+        if apart(pair) > SAME_SIZE:
+            break
+        clusters[pair[0]] += clusters.pop(pair[1])
+    return clusters
+
+
+def test_entries_are_those_of_a_plain_loop(rooms):
+    found_m, numbers = find_sizes(rooms.rooms, rooms.prototypes, PROTOTYPES)
+    own: dict[int, list[np.ndarray]] = {}
+    for room, item in rooms.rooms.is_object.nonzero().tolist():
+        prototype, pose = divmod(int(rooms.rooms.looks[room, item]), POSES)
+        size_m = rooms.rooms.boxes_m[room, item, 3:].double().numpy()
+        own.setdefault(prototype, []).append(size_m[::-1] if pose % 2 else size_m)
+    assert max(map(len, own.values())) > 20
+    for prototype, each in own.items():
+        clusters = [one for one in complete_linkage(each) if len(one) >= COMMON]
+        wanted = {tuple(np.median(one, axis=0).round(5)): len(one) for one in clusters}
+        used = numbers[prototype] > 0
+        rows_m = found_m[prototype, used].double().numpy().round(5)
+        found = dict(zip(map(tuple, rows_m), numbers[prototype, used].tolist(), strict=True))
+        assert len(found) > 1
+        assert sorted(found.values()) == sorted(wanted.values())
+        assert_close(np.array(sorted(found)), np.array(sorted(wanted)), atol=2e-5, rtol=0)
+
+
+def test_the_most_frequent_are_kept(rooms, monkeypatch):
+    _, every = find_sizes(rooms.rooms, rooms.prototypes, PROTOTYPES)
+    monkeypatch.setattr(module, "SIZES", 2)
+    _, few = find_sizes(rooms.rooms, rooms.prototypes, PROTOTYPES)
+    assert torch.equal(few, every[:, :2])
+    assert (every.diff(dim=1) <= 0).all()
+
+
+def test_a_room_turned_or_mirrored_teaches_the_same_sizes(rooms):
+    plain = find_sizes(rooms.rooms, rooms.prototypes, PROTOTYPES)
+    turned = turned_rooms(rooms.rooms, torch.arange(len(rooms)) % 8)
+    for one, other in zip(plain, find_sizes(turned, rooms.prototypes, PROTOTYPES), strict=True):
+        assert_close(one, other)
+
+
+def test_a_prototype_with_one_object_or_none_has_one_size():
+    rooms = sampler_rooms()
+    alone = rooms.rooms.only(torch.arange(len(rooms))[:, None] == 1)
+    found_m, numbers = find_sizes(alone, rooms.prototypes, PROTOTYPES)
+    none = rooms.rooms.only(torch.zeros(len(rooms), 1, dtype=torch.bool))
+    own_m, ones = find_sizes(none, rooms.prototypes, PROTOTYPES)
+    used = len(rooms.prototypes.sizes_m)
+    assert_close(own_m[:used, 0], torch.from_numpy(rooms.prototypes.sizes_m).float())
+    wanted = torch.zeros(PROTOTYPES, SIZES)
+    wanted[:used, 0] = 1
+    assert torch.equal(ones, wanted) and torch.equal(numbers, wanted)
+    first = int(alone.looks[1, 0])
+    assert_close(found_m[first // POSES, 0].sort().values, alone.boxes_m[1, 0, 3:].sort().values)
+
+
+def test_sizes_are_drawn_as_often_as_they_occur_in_the_pose_of_the_look():
+    sampler = small_sampler(sampler_rooms())
+    sampler.sizes_m[0, :2] = torch.tensor([[2.0, 0.8, 1.4], [1.0, 0.5, 0.6]])
+    sampler.size_counts[0] = torch.eye(SIZES)[0] * 3 + torch.eye(SIZES)[1]
+    uniform = (torch.arange(400) + 0.5) / 400
+    for pose in range(POSES):
+        drawn = sampler.draw_size(torch.full((400,), pose), uniform)
+        wanted = sampler.sizes_m[0, [0] * 300 + [1] * 100]
+        assert torch.equal(drawn, wanted.flip(-1) if pose % 2 else wanted)
+
+
+def test_drawn_rooms_hold_sizes_of_the_training_rooms_alone():
+    sampler = small_sampler(sampler_rooms())
+    drawn = draw_rooms(sampler, 30, 0)
+    assert drawn.is_object.any()
+    for look, size_m in zip(
+        drawn.looks[drawn.is_object], drawn.boxes_m[drawn.is_object][:, 3:], strict=True
+    ):
+        own_m = size_m.flip(0) if look % 2 else size_m
+        assert (sampler.sizes_m[look // POSES] == own_m).all(dim=-1).any()
