@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 from scipy import ndimage
-from tracks import moved, rooms
+from tracks import NOISES, moved, rooms
 
 from data_prep.front.houses import house_files
 from data_prep.front.models import ModelBank
@@ -132,7 +132,9 @@ def spoilt(views: RoomViews, seed: int) -> RoomViews:
     """A room with displaced poses and ragged masks."""
     assert views.stuff is not None
     rng = np.random.default_rng(seed)
-    poses = np.stack([moved(pose, rng) for pose in views.world_to_camera.astype(np.float64)])
+    poses = np.stack(
+        [moved(pose, NOISES["noisy"], rng) for pose in views.world_to_camera.astype(np.float64)]
+    )
     number, *places = np.indices(views.stuff.shape)
     moves = []
     for place, side in zip(places, views.stuff.shape[1:], strict=True):

@@ -1,9 +1,10 @@
 """Accuracy of the objects found from masks whose ids are not consistent across frames.
 
-Run `python benchmarks/tracks.py SHARDS ... [--noise 0 1]`. The shards must hold 3D ground truth,
-as those of `make-homes` with `prep-front` do. Every frame gets new random ids. The noise, drawn by
-the seed, removes 10% of the masks, merges 5% with the nearest mask of the same view, cuts 5% in
-two, gives 5% the class of another object, and displaces each pose by 1 cm and 0.5 degrees.
+Run `python benchmarks/tracks.py SHARDS ... [--noise clean noisy]`. The shards must hold 3D ground
+truth, as those of `make-homes` with `prep-front` do. Every frame gets new random ids. The noise,
+drawn by the seed, removes 10% of the masks, merges 5% with the nearest mask of the same view, cuts
+5% in two, gives 5% the class of another object, and displaces each pose by 1 cm and 0.5 degrees;
+other names of `NOISES` are parts of it.
 """
 
 import argparse
@@ -22,9 +23,29 @@ from sceneprior.core.overlaps import box_iou_3d
 from sceneprior.core.shards import RoomGroundTruth, RoomViews, Shard, list_shards
 from sceneprior.lifted.lifting.boxes import lift_boxes
 
-MISSING, MERGED, CUT, WRONG_CLASS = 0.1, 0.05, 0.05, 0.05
-DEGREES, METRES = 0.5, 0.01
 UNKNOWN = -1
+
+
+class Noise(NamedTuple):
+    """Shares of the masks that are wrong, and the error of each pose."""
+
+    missing: float = 0.0
+    merged: float = 0.0
+    cut: float = 0.0
+    wrong_class: float = 0.0
+    degrees: float = 0.0
+    metres: float = 0.0
+
+
+NOISES = {
+    "clean": Noise(),
+    "missing": Noise(missing=0.1),
+    "merged": Noise(merged=0.05),
+    "cut": Noise(cut=0.05),
+    "moved": Noise(metres=0.01),
+    "turned": Noise(degrees=0.5),
+    "noisy": Noise(0.1, 0.05, 0.05, 0.05, 0.5, 0.01),
+}
 
 
 class Frames(NamedTuple):
@@ -34,8 +55,8 @@ class Frames(NamedTuple):
     world_to_camera: np.ndarray
 
 
-def shuffled(views: RoomViews, noisy: bool, seed: int) -> Frames:
-    """Give every mask of every view a unique id, in random order; with noise on request."""
+def shuffled(views: RoomViews, noise: Noise, seed: int) -> Frames:
+    """Give every mask of every view a unique id, in random order, after noise."""
     assert views.instance_ids is not None, "read with images"
     rng = np.random.default_rng(seed)
     void = len(views.object_class) + 1
@@ -44,9 +65,8 @@ def shuffled(views: RoomViews, noisy: bool, seed: int) -> Frames:
     classes: list[int] = []
     for view, image in enumerate(views.instance_ids.astype(np.int64)):
         class_of = {k + 1: int(name) for k, name in enumerate(views.object_class)}
-        if noisy:
-            image, class_of = _spoilt(image, class_of, void, rng)
-            poses[view] = moved(poses[view], rng)
+        image, class_of = _spoilt(image, class_of, void, noise, rng)
+        poses[view] = moved(poses[view], noise, rng)
         ids[view][image == void] = UNKNOWN
         numbers = [k for k in np.unique(image).tolist() if k not in (0, void)]
         for k in rng.permutation(numbers).tolist():
@@ -56,23 +76,27 @@ def shuffled(views: RoomViews, noisy: bool, seed: int) -> Frames:
 
 
 def _spoilt(
-    image: np.ndarray, class_of: dict[int, int], void: int, rng: np.random.Generator
+    image: np.ndarray,
+    class_of: dict[int, int],
+    void: int,
+    noise: Noise,
+    rng: np.random.Generator,
 ) -> tuple[np.ndarray, dict[int, int]]:
     """An image of ids after masks are removed, merged and cut, and the ids' classes, some wrong."""
     image, class_of = image.copy(), dict(class_of)
     for k in _numbers(image, void):
-        if rng.random() < MISSING:
+        if rng.random() < noise.missing:
             image[image == k] = 0
     for k in _numbers(image, void):
         others = [other for other in _numbers(image, void) if other != k]
-        if rng.random() < MERGED and others and (image == k).any():
+        if rng.random() < noise.merged and others and (image == k).any():
             far = ndimage.distance_transform_edt(image != k)
             nearest = min(others, key=lambda other: far[image == other].min())
             if (image == nearest).sum() > (image == k).sum():
                 class_of[k] = class_of[nearest]
             image[image == nearest] = k
     for k in _numbers(image, void):
-        if rng.random() < CUT:
+        if rng.random() < noise.cut:
             y, x = np.nonzero(image == k)
             angle = rng.uniform(0, np.pi)
             side = (x - x.mean()) * np.cos(angle) + (y - y.mean()) * np.sin(angle) > 0
@@ -81,7 +105,7 @@ def _spoilt(
             image[y[side], x[side]] = part
     names = sorted(set(class_of.values()))
     for k in _numbers(image, void):
-        if rng.random() < WRONG_CLASS and len(names) > 1:
+        if rng.random() < noise.wrong_class and len(names) > 1:
             class_of[k] = int(rng.choice([name for name in names if name != class_of[k]]))
     return image, class_of
 
@@ -90,14 +114,14 @@ def _numbers(image: np.ndarray, void: int) -> list[int]:
     return [k for k in np.unique(image).tolist() if k not in (0, void)]
 
 
-def moved(pose: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def moved(pose: np.ndarray, noise: Noise, rng: np.random.Generator) -> np.ndarray:
     """A camera turned about a random axis and moved in a random direction."""
     axis, way = (vector / np.linalg.norm(vector) for vector in rng.normal(size=(2, 3)))
     cross = np.cross(np.eye(3), axis)
-    angle = np.radians(DEGREES)
+    angle = np.radians(noise.degrees)
     change = np.eye(4)
     change[:3, :3] += np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-    change[:3, 3] = METRES * way
+    change[:3, 3] = noise.metres * way
     return change @ pose
 
 
@@ -115,10 +139,10 @@ class Score(NamedTuple):
     seconds: float
 
 
-def score(views: RoomViews, truth: RoomGroundTruth, noisy: bool, seed: int) -> Score:
+def score(views: RoomViews, truth: RoomGroundTruth, noise: Noise, seed: int) -> Score:
     """Find the objects of one room from its masks, and compare them with the true objects."""
     assert views.instance_ids is not None
-    frames = shuffled(views, noisy, seed)
+    frames = shuffled(views, noise, seed)
     start = time.process_time()
     found = associate(frames.masks, frames.world_to_camera, views.intrinsics)
     seconds = time.process_time() - start
@@ -199,7 +223,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--rooms", type=int, default=24)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--noise", type=int, nargs="+", default=[0, 1])
+    parser.add_argument("--noise", choices=NOISES, nargs="+", default=["clean", "noisy"])
     parser.add_argument("--each", action="store_true", help="print every room")
     options = parser.parse_args()
     print(
@@ -208,13 +232,13 @@ def main() -> None:
     )
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
     for folder in options.shards:
-        for noisy in map(bool, options.noise):
+        for name in options.noise:
             scores = []
             for seed in options.seeds:
                 for place, (views, truth) in enumerate(
                     rooms(folder, options.split, options.first, options.rooms)
                 ):
-                    scores.append(score(views, truth, noisy, 1000 * seed + place))
+                    scores.append(score(views, truth, NOISES[name], 1000 * seed + place))
                     if options.each:
                         print(
                             place, views.room_id[:20], *(f"{x:.3f}" for x in scores[-1]), flush=True
@@ -222,7 +246,7 @@ def main() -> None:
             rand, found, true, iou, with_ids, seconds = np.array(scores).T
             print(
                 f"| {folder.name} {options.split} ({len(scores)}) "
-                f"| {'noisy' if noisy else 'clean'} "
+                f"| {name} "
                 f"| {rand.mean():.3f} | {rand.min():.3f} | {found.sum():.0f} / {true.sum():.0f} "
                 f"| {iou.mean():.3f} | {with_ids.mean():.3f} "
                 f"| {np.median(seconds):.2f}, at most {seconds.max():.2f} |",

@@ -7,9 +7,9 @@ from sceneprior.core.shards import RoomViews
 from sceneprior.lifted.lifting.hulls import MOST_EMPTY, Sightings, carve, cells_along, sightings_of
 from sceneprior.lifted.lifting.lifted import LiftedBoxes
 
-GRIDS = ((16, 0.6), (24, 0.6), (40, 0.4))
-"""Cells along an edge and their `reach` (see `carve`), coarse to fine: each grid spans the hull
-found on the previous one."""
+GRIDS = ((16, 0.6), (24, 0.6), (40, 0.4), (40, 0.4))
+"""Cells along an edge and their `reach` (see `carve`), coarse to fine: each grid spans the box
+found on the previous one, and a cell more at each side."""
 EXPLAINED = 0.985
 """Share of an object's rays that its hull must meet; the others may be wrong pixels."""
 RAYS = 400
@@ -27,8 +27,9 @@ def lift_boxes(
 ) -> LiftedBoxes:
     """3D boxes of a room's objects, from instance ids and cameras; no 3D ground truth is used.
 
-    An object's visual hull is carved coarse to fine. Its box is then shrunk, side after side, as
-    long as every ray through one of its pixels meets a cell of the hull inside.
+    An object's visual hull is carved coarse to fine. On each grid, its box is shrunk, side after
+    side, as long as every ray through one of its pixels meets a cell of the hull inside; the next
+    grid spans this box, and leaves out what else the views fail to rule out.
 
     `views` is a room, read with its images, of which only the views `chosen` are used (None: all).
     `seed` chooses the pixels whose rays are used.
@@ -56,14 +57,12 @@ def _lift(
     for cells, reach in GRIDS:
         hull = carve(seen, low_m, high_m, cells, reach)
         where, emptiness = cells_along(hull, origins_m, directions, 3 * cells)
-        limit = _limit(emptiness.min(axis=1))
-        inside = np.argwhere(hull.emptiness <= limit)
-        if not len(inside):
+        in_hull = emptiness <= _limit(emptiness.min(axis=1))
+        first, last = smallest_box(where, in_hull, cells)
+        if not in_hull.any():
             break
-        low_m = hull.low_m + (inside.min(axis=0) - 1) * hull.cell_m
-        high_m = hull.low_m + (inside.max(axis=0) + 2) * hull.cell_m
-    in_hull = emptiness <= limit
-    first, last = smallest_box(where, in_hull, hull.emptiness.shape[0])
+        low_m = hull.low_m + (first - 1) * hull.cell_m
+        high_m = hull.low_m + (last + 1) * hull.cell_m
     trim = np.where(last - first > 1, TRIM, 0.0)
     explained = float(in_hull.any(axis=1).mean())
     return (

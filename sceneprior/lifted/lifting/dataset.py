@@ -26,7 +26,7 @@ from sceneprior.core.wall_lines import Wall, find_walls
 from sceneprior.lifted.lifting.lifted import HANGS_M, LiftedBoxes, RayPool, ShapeGrid
 from sceneprior.lifted.prototypes import Prototypes, choose_prototypes, turned_looks
 
-VERSION = 1
+VERSION = 2
 """Version of the cached boxes."""
 SHAPES_VERSION = 5
 """Version of the cached hulls and rays. Raise it, or `VERSION`, when the same views give others."""
