@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import shapely
 import trimesh
-from tracks import ideal_ids, rooms, shuffled
+from tracks import NOISES, ideal_ids, rooms, shuffled
 
 from data_prep.heading import find_turn, turn_matrix
 from sceneprior.core.geometry.turns import yaw_rotation
@@ -55,7 +55,7 @@ def turned(views: RoomViews, degrees: float) -> RoomViews:
 def given(views: RoomViews, noisy: bool, seed: int) -> tuple[RoomViews, np.ndarray]:
     """Views with the noise of tracks.py and the ids of the true objects, and the rows of the true
     objects that are still visible."""
-    frames = shuffled(views, noisy, seed)
+    frames = shuffled(views, NOISES["noisy" if noisy else "clean"], seed)
     ids, void = ideal_ids(frames.masks.ids, views), len(views.object_class) + 1
     seen = observe(np.where(ids < 0, void, ids).astype(np.uint32), [*views.object_class, 0])
     made = seen.room_views(views.room_id, frames.world_to_camera, views.intrinsics)
