@@ -7,8 +7,9 @@ and shapes of as many training rooms, always for the same number of steps. Homes
 from one seed, so the rooms of a smaller set are among those of a larger one. All priors are judged
 on the test rooms of the largest set, and the layout classifier learns from that set's training and
 val rooms: 0.5 is best. `relations` is the Wasserstein distance of gaps between classes in metres.
-Both are printed for the sampler, for rooms from anywhere on the sphere (`paper`), and for real
-training rooms. CPU minutes are those of `fit`, lifting included, and of preparation.
+Both are printed for the sampler, for rooms from anywhere on the sphere (`paper`), for training
+rooms decoded from their own latents, and for real training rooms. CPU minutes are those of `fit`,
+lifting included, and of preparation.
 
 Steps that have their result in OUT are not repeated.
 """
@@ -31,13 +32,15 @@ import sceneprior
 from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.scene import Scene
 from sceneprior.evaluation.metrics.relations import METRICS
+from sceneprior.paper.decode import decode_training_rooms
 
 TRAIN_SHARE = 0.7
 """Share of made homes in the train split."""
 STEPS = {"shape": 3000, "sampler": 2000}
 """Training steps of the sphere and of the sampler, at every size."""
 BATCH = {"shape": 28, "sampler": 24}
-DISTRIBUTIONS = ("sampler", "paper")
+SETS = {"sampler": "sampler", "paper": "sphere, anywhere", "decoded": "decoded training rooms"}
+"""Sets of rooms, with their names in the plot."""
 DRAWN = 600
 
 
@@ -57,18 +60,24 @@ def main() -> None:
     test = scenes_of(shards, "test")
     few = np.random.default_rng(arguments.seed).permutation(len(real))[:DRAWN]
     print(f"{len(test)} test rooms; {DRAWN} rooms drawn with seed {arguments.seed}")
-    print(f"real training rooms: relations {relations([real[k] for k in few], real, test):.2f} m")
+    some = [real[k] for k in few]
+    print(f"real training rooms: relations {relations(some, real, test):.2f} m")
     rows: list[dict[str, Any]] = []
     for size in sizes:
         folder = out / str(size)
         prior = sceneprior.load(folder / "run")
         spent = json.loads((folder / "cpu_minutes.json").read_text())
-        for distribution in DISTRIBUTIONS:
-            rooms = prior.sample(DRAWN, seed=arguments.seed, distribution=distribution)
+        for name in SETS:
+            if name == "decoded":
+                known = decode_training_rooms(prior.trained)
+                chosen = np.random.default_rng(arguments.seed).permutation(len(known))[:DRAWN]
+                rooms = [known[k] for k in chosen]
+            else:
+                rooms = prior.sample(DRAWN, seed=arguments.seed, distribution=name)
             rooms = [room.without_meshes() for room in rooms]
             row = {
                 "rooms": size,
-                "distribution": distribution,
+                "set": name,
                 "classifier": accuracy(rooms, real, test, arguments.seed),
                 "relations_m": round(relations(rooms, real, test), 3),
                 "prepare_cpu_min": round(spent["prepare"], 1),
@@ -131,7 +140,7 @@ def relations(rooms: Sequence[Scene], real: Sequence[Scene], test: Sequence[Scen
 
 
 def plot(rows: Sequence[dict[str, Any]], path: Path) -> None:
-    """Draw both metrics against the number of rooms, with a line for each distribution."""
+    """Draw both metrics against the number of rooms, with a line for each set."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -141,10 +150,9 @@ def plot(rows: Sequence[dict[str, Any]], path: Path) -> None:
         (("classifier", "layout classifier (0.5 is best)"), ("relations_m", "gaps, m (0 is best)"))
     ):
         axes = figure.add_subplot(1, 2, column + 1)
-        for distribution in DISTRIBUTIONS:
-            mine = [row for row in rows if row["distribution"] == distribution]
-            name = "sampler" if distribution == "sampler" else "sphere"
-            axes.plot([r["rooms"] for r in mine], [r[key] for r in mine], marker="o", label=name)
+        for name, label in SETS.items():
+            mine = [row for row in rows if row["set"] == name]
+            axes.plot([r["rooms"] for r in mine], [r[key] for r in mine], marker="o", label=label)
         axes.set_xscale("log")
         axes.set_xticks(sizes := sorted({row["rooms"] for row in rows}), map(str, sizes))
         axes.set_xlabel("training rooms")
