@@ -17,7 +17,7 @@ from data_prep.posed.untracked import UntrackedMasks, track
 from sceneprior.core.errors import InputError
 from sceneprior.core.instances.checked import shown
 from sceneprior.core.instances.observations import Observations, observe
-from sceneprior.core.shards import stuff_step, thinned
+from sceneprior.core.shards import thinned_stuff
 
 TRACKS = ("given", "auto")
 _MANY_IDS, _MANY_FRAMES, _ONCE = 12, 5, 0.8
@@ -102,11 +102,11 @@ def prepare_posed(
     frames = [recording.frames[i] for i in choice.frames]
     unit = settings.metres_per_unit
     upright, turn = upright_cameras(recording, [*choice.frames], settings.up, unit)
+    cameras = room_cameras(upright, np.eye(4))
     try:
         if settings.tracks == "auto" or not masks.tracked:
             untracked = UntrackedMasks(masks, size, stored)
             given, ids, stuff, intrinsics = untracked.read(frames)
-            cameras = room_cameras(upright, np.eye(4))
             images, classes, said = track(given, ids, cameras, intrinsics)
             notes += [*untracked.notes, said]
         else:
@@ -123,12 +123,7 @@ def prepare_posed(
     seen = observe(images, classes)
     if not len(seen.tracked):
         return None
-    views = seen.room_views(
-        room_name(recording.folder), room_cameras(upright, np.eye(4)), intrinsics
-    )
-    if stuff.any():
-        small = (..., *thinned(stuff_step(views.image_size)))
-        views = replace(views, stuff=stuff[small] * (seen.instance_ids[small] == 0))
+    views = seen.room_views(room_name(recording.folder), cameras, intrinsics, thinned_stuff(stuff))
     degrees = find_turn(views)
     notes += note_of_turn(degrees)
     if degrees:

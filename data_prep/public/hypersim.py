@@ -78,12 +78,12 @@ class Hypersim(Reader):
         ]
         instances, semantics = (np.stack(kind) for kind in zip(*arrays, strict=True))
         del arrays
-        ids, classes = ids_and_classes(instances, semantics, str(scene))
+        ids, classes, stuff = ids_and_classes(instances, semantics, str(scene))
         cameras = Y_UP @ poses[list(choice.frames)] @ GL_TO_CV
         cameras[:, :3, :3] = cameras[:, :3, :3] @ tilt.T
         boxes = _boxes(scene / "_detail" / "mesh", unit)
         return FramedRoom(
-            ids, classes, cameras, intrinsics, boxes,
+            ids, classes, cameras, intrinsics, boxes, stuff=stuff,
             notes=tuple(choice.notes("image of ids")),
         )  # fmt: skip
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from data_prep.scannet.labels import SHELL
 from sceneprior.core.errors import InputError
-from sceneprior.core.instances.tables import LARGEST_ID
+from sceneprior.core.instances.tables import LARGEST_ID, stuff_of
 
 NYU40 = (
     "wall", "floor", "cabinet", "bed", "chair", "sofa", "table", "door", "window", "bookshelf",
@@ -37,7 +37,7 @@ LIKE_NYU40 = {
 
 def ids_and_classes(
     instances: np.ndarray, semantics: np.ndarray, where: str
-) -> tuple[np.ndarray, dict[int, str]]:
+) -> tuple[np.ndarray, dict[int, str], np.ndarray]:
     """Combine images of instance ids (-1 = none) with images of NYU40 ids (0 or less = none).
 
     An instance has the class of most of its pixels, over all images. A pixel without an instance
@@ -46,13 +46,14 @@ def ids_and_classes(
 
     Returns:
         Images of numbers, int32 of the same shape: instance + 1, 0 for background, -1 for unknown;
-        and the class of each number.
+        the class of each number; and images of indices into `STUFF`, uint8.
 
     Example: instance 7 is a chair (5) with one pixel of a table; a wall (1), a lamp without an id.
 
         >>> instances, semantics = np.array([[7, 7, 7, -1, -1]]), np.array([[5, 5, 7, 1, 35]])
-        >>> ids_and_classes(instances, semantics, "scene")
-        (array([[ 8,  8,  8,  0, -1]], dtype=int32), {8: 'chair'})
+        >>> ids, classes, stuff = ids_and_classes(instances, semantics, "scene")
+        >>> ids.tolist(), classes, stuff.tolist()
+        ([[8, 8, 8, 0, -1]], {8: 'chair'}, [[0, 0, 0, 2, 0]])
     """
     if semantics.max(initial=0) > len(NYU40):
         raise InputError(
@@ -75,4 +76,5 @@ def ids_and_classes(
     ids = np.where(is_shell[best], 0, np.arange(count)).astype(np.int32)[numbers]
     ids[numbers == 0] = np.where(is_shell[semantics[numbers == 0]], 0, -1)
     found = np.flatnonzero(votes.any(axis=1) & ~is_shell[best]).tolist()
-    return ids, {k: names[best[k]] for k in found if k}
+    stuff = np.array([stuff_of(name) for name in names], dtype=np.uint8)
+    return ids, {k: names[best[k]] for k in found if k}, stuff[semantics]

@@ -24,7 +24,7 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.geometry.corners import CUBE_CORNERS
 from sceneprior.core.instances.observations import Observations, observe
 from sceneprior.core.instances.tables import IdTable, tidy
-from sceneprior.core.shards import RoomGroundTruth
+from sceneprior.core.shards import RoomGroundTruth, thinned_stuff
 from sceneprior.core.shell import rectangle
 
 
@@ -48,6 +48,9 @@ class FramedRoom:
     """(P, 2) x, z of the floor's outline; None takes the rectangle around these boxes."""
     ceiling_y: float | None = None
     """Height of the ceiling; None takes the highest point of all boxes and cameras."""
+    stuff: np.ndarray | None = None
+    """(views, height, width) uint8 indices into `STUFF`; None if the data set has no such
+    images."""
     notes: tuple[str, ...] = ()
 
 
@@ -139,7 +142,8 @@ def prepare_room(room_id: str, room: FramedRoom, label_set_name: str) -> Prepare
     if not len(seen.tracked):
         return None
     cameras = room_cameras(room.camera_to_world, np.eye(4))
-    degrees = find_turn(seen.room_views(room_id, cameras, room.intrinsics))
+    stuff = None if room.stuff is None else thinned_stuff(room.stuff)
+    degrees = find_turn(seen.room_views(room_id, cameras, room.intrinsics, stuff))
     if degrees:
         room = _turned(room, degrees)
     boxes_of = {
@@ -173,7 +177,7 @@ def prepare_room(room_id: str, room: FramedRoom, label_set_name: str) -> Prepare
         ceiling_y = max(tops) if room.ceiling_y is None else room.ceiling_y
         height_m = float(ceiling_y - floor_y)
         truth = _truth(boxes_of, table, seen, origin, outline - center, height_m)
-    views = seen.room_views(room_id, world_to_camera, room.intrinsics)
+    views = seen.room_views(room_id, world_to_camera, room.intrinsics, stuff)
     if degrees:
         world = room_from_world @ turn_matrix(degrees)
         views = replace(views, turned_deg=degrees, room_from_world=world)

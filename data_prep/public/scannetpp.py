@@ -110,21 +110,23 @@ class ScanNetPP(Reader):
             )
         parts = object_parts(groups, segments)
         labels = _labels(self.folder)
-        ids_of_vertices, classes = _ids(groups, parts, labels, len(mesh.vertices_m))
+        vertex_ids, vertex_stuff, classes = _ids(groups, parts, labels, len(mesh.vertices_m))
         stored = shrunk(size, max_side)
         scale = np.array([stored[1] / size[1], stored[0] / size[0], 1.0])
         lenses = intrinsics[frames] * scale[:, None]
-        of_face = _ids_of_faces(ids_of_vertices[mesh.faces])
-        images = [
-            _drawn(mesh, of_face, camera, K, stored)
+        faces = [
+            _nearest_faces(mesh, camera, K, stored)
             for camera, K in zip(np.linalg.inv(cameras), lenses, strict=True)
         ]
+        # The last entry is for pixels without a face.
+        ids = np.append(_most_common(vertex_ids[mesh.faces]), np.int32(-1))[np.stack(faces)]
+        stuff = np.append(_most_common(vertex_stuff[mesh.faces]), np.uint8(0))[np.stack(faces)]
         points = {k + 1: mesh.vertices_m[part] for k, part in enumerate(parts) if len(part)}
         floors = [part for group, part in zip(groups, parts, strict=True)
                   if labels.nyu40.get(group.category.strip().lower()) == "floor"]  # fmt: skip
         heights = mesh.vertices_m[np.concatenate(floors), 1] if floors else np.zeros(0)
         return FramedRoom(
-            np.stack(images), classes, cameras, lenses, points,
+            ids, classes, cameras, lenses, points, stuff=stuff,
             floor_y=float(np.median(heights)) if len(heights) else None,
             ceiling_y=float(high[1]), notes=(*notes, *choice.notes("image of ids")),
         )  # fmt: skip
@@ -191,34 +193,32 @@ def _labels(folder: Path) -> Labels:
 
 def _ids(
     groups: list[Group], parts: list[np.ndarray], labels: Labels, vertices: int
-) -> tuple[np.ndarray, dict[int, str]]:
+) -> tuple[np.ndarray, np.ndarray, dict[int, str]]:
     """Number of each vertex, (V,) int32: k + 1 for group k, 0 for the room itself, -1 for no group;
-    and the classes. A vertex of several groups belongs to the smallest."""
+    index into `STUFF` of each vertex, uint8; and the classes. A vertex of several groups belongs to
+    the smallest."""
     numbers = np.full(vertices, -1, dtype=np.int32)
+    stuff = np.zeros(vertices, dtype=np.uint8)
     classes = {}
     for k in sorted(range(len(groups)), key=lambda k: -len(parts[k])):
         is_shell = labels.is_shell(groups[k].category)
         numbers[parts[k]] = 0 if is_shell else k + 1
+        stuff[parts[k]] = labels.stuff(groups[k].category)
         if not is_shell and len(parts[k]):
             name = labels.label(groups[k].category)
             classes[k + 1] = groups[k].category if name == "void" else name
-    return numbers, classes
+    return numbers, stuff, classes
 
 
-def _ids_of_faces(corners: np.ndarray) -> np.ndarray:
-    """Number that most corners of a face have, (F,); the first corner's if all differ."""
+def _most_common(corners: np.ndarray) -> np.ndarray:
+    """Value that most corners of a face have, (F,); the first corner's if all differ."""
     first, second, third = corners.T
     return np.where(second == third, second, first)
 
 
-def _drawn(
-    mesh: Mesh,
-    of_face: np.ndarray,
-    world_to_camera: np.ndarray,
-    K: np.ndarray,
-    image_size: tuple[int, int],
+def _nearest_faces(
+    mesh: Mesh, world_to_camera: np.ndarray, K: np.ndarray, image_size: tuple[int, int]
 ) -> np.ndarray:
-    """Image of the numbers of the nearest faces; -1 where there is none."""
+    """Image of the nearest faces' indices; -1 where there is none."""
     projection = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
-    face, _ = rasterize(mesh.vertices_m, mesh.faces, world_to_camera, projection, image_size)
-    return np.where(face < 0, -1, of_face[face]).astype(np.int32)
+    return rasterize(mesh.vertices_m, mesh.faces, world_to_camera, projection, image_size)[0]

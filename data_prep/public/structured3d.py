@@ -128,12 +128,12 @@ class Structured3D(Reader):
                 images.append(image[lines])
         numbers = np.stack(instances)
         numbers[numbers == _NONE] = -1
-        ids, classes = ids_and_classes(numbers, np.stack(semantics), str(room))
+        ids, classes, stuff = ids_and_classes(numbers, np.stack(semantics), str(room))
         floor_m, ceiling_y, floor_y = _read_floor(scene / "annotation_3d.json", room.name)
         return FramedRoom(
             ids, classes, Y_UP @ poses[list(choice.frames)], np.stack(intrinsics),
             _read_boxes(scene / "bbox_3d.json"), floor_y, floor_m, ceiling_y,
-            tuple(choice.notes("image of ids")),
+            stuff, tuple(choice.notes("image of ids")),
         )  # fmt: skip
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
+from sceneprior.core.instances.tables import stuff_of
 
 LABEL_SET = "scannet"
 SHELL = frozenset(
@@ -35,6 +36,10 @@ class Labels:
     def is_shell(self, category: str) -> bool:
         """Test whether this is a part of the room, such as a wall, rather than furniture."""
         return self.nyu40.get(_tidy(category), "") in SHELL
+
+    def stuff(self, category: str) -> int:
+        """Index into `STUFF`; 0 for furniture, and for parts of the room without such a class."""
+        return stuff_of(self.nyu40.get(_tidy(category), ""))
 
 
 def read_labels(path: Path) -> Labels:

@@ -67,6 +67,8 @@ class Instance:
     """Class of the label set `scannet`; `void` outside its 19 classes."""
     is_shell: bool
     """True for a part of the room (wall, floor, ...), false for furniture."""
+    stuff: int
+    """Index into `STUFF`."""
     lower_m: np.ndarray
     upper_m: np.ndarray
     """(3,) float64 corners of the axis-aligned box."""
@@ -177,7 +179,8 @@ def read_scan(
         kind, is_shell = labels.label(group.category), labels.is_shell(group.category)
         corners = box[0] - origin, box[1] - origin
         surface = None if kind == "void" else surface_of(mesh, part)
-        instances.append(Instance(group.object_id, kind, is_shell, *corners, part, surface))
+        stuff = labels.stuff(group.category)
+        instances.append(Instance(group.object_id, kind, is_shell, stuff, *corners, part, surface))
     half = (upper - lower)[[0, 2]] / 2
     choice, world_to_camera, intrinsics, masks = _read_cameras(folder, room_from_scan, settings)
     notes += choice.notes("mask")

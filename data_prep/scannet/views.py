@@ -11,29 +11,32 @@ from data_prep.scannet.scans import Scan
 from sceneprior.core.classes import label_set
 from sceneprior.core.instances.observations import observe
 from sceneprior.core.scene import Mesh
-from sceneprior.core.shards import RoomGroundTruth
+from sceneprior.core.shards import RoomGroundTruth, thinned_stuff
 
 
-def instance_images(scan: Scan) -> tuple[np.ndarray, list[int]]:
-    """Read the instance ids of all views, and the object ids missing from the aggregation.
+def instance_images(scan: Scan) -> tuple[np.ndarray, np.ndarray, list[int]]:
+    """Read the instance ids and the stuff of all views, and the object ids missing from the
+    aggregation.
 
     Masks are downsampled without averaging (`sampled_lines`); `scan.intrinsics` accounts for the
     offset of the sampled pixels' centres.
 
     Returns:
         (views, height, width): 0 = no object or the room's shell, k + 1 = instance k of the scan,
-        and len(instances) + 1 = an object id that is missing; and the missing ids, ascending.
+        and len(instances) + 1 = an object id that is missing; indices into `STUFF`, uint8, at the
+        pixels of `thinned_stuff`; and the missing ids, ascending.
     """
-    table, known = _ids_of_values(scan)
-    images, unlisted = [], set()
+    table, stuff_table, known = _tables_of_values(scan)
+    images, stuff, unlisted = [], [], set()
     with MaskArchive(scan.masks) as masks:
         sizes = zip(masks.image_size, scan.settings.image_size, strict=True)
         lines = np.ix_(*(sampled_lines(*size) for size in sizes))
         for frame in scan.frames:
             values = masks.read(frame)[lines]
             images.append(table[values])
+            stuff.append(stuff_table[thinned_stuff(values)])
             unlisted.update(np.setdiff1d(values, known).tolist())
-    return np.stack(images), sorted(value - 1 for value in unlisted)
+    return np.stack(images), np.stack(stuff), sorted(value - 1 for value in unlisted)
 
 
 def prepare_scan(scan: Scan) -> PreparedRoom | None:
@@ -46,7 +49,7 @@ def prepare_scan(scan: Scan) -> PreparedRoom | None:
     `unoccluded` accounts for these, but only `inspect --verify` uses it.
     """
     names = label_set(LABEL_SET)
-    images, unlisted = instance_images(scan)
+    images, stuff, unlisted = instance_images(scan)
     # The last entry stands for ids without an object, which may occlude others.
     labels = [*(item.label for item in scan.instances), "void"]
     classes = np.array([names.index(label) for label in labels], dtype=np.int16)
@@ -58,23 +61,26 @@ def prepare_scan(scan: Scan) -> PreparedRoom | None:
     if unlisted:
         listed = ", ".join(map(str, unlisted))
         notes += (f"masks show objects that the aggregation does not have ({listed}): void",)
-    views = seen.room_views(scan.scan_id, scan.world_to_camera, scan.intrinsics)
+    views = seen.room_views(scan.scan_id, scan.world_to_camera, scan.intrinsics, stuff)
     order = np.concatenate([seen.tracked, seen.unseen])
     truth, models = _ground_truth(scan, order, classes[order], unoccluded(scan, seen.tracked))
     return PreparedRoom(views, truth, models, notes=notes)
 
 
-def _ids_of_values(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
-    """Table of our ids by mask value, (256,), and the mask values known to the aggregation."""
+def _tables_of_values(scan: Scan) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Our ids and the indices into `STUFF` by mask value, (256,) each, and the mask values known
+    to the aggregation."""
     unknown = len(scan.instances) + 1
     table = np.full(256, unknown, dtype=np.uint8 if unknown <= 255 else np.uint16)
     table[0] = 0
+    stuff = np.zeros(256, dtype=np.uint8)
     known = [0]
     for k, item in enumerate(scan.instances):
         if item.object_id < 255:  # an 8-bit mask cannot show more
             table[item.object_id + 1] = 0 if item.is_shell else k + 1
+            stuff[item.object_id + 1] = item.stuff
             known.append(item.object_id + 1)
-    return table, np.array(known)
+    return table, stuff, np.array(known)
 
 
 def _ground_truth(

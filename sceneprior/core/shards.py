@@ -283,6 +283,11 @@ def stuff_step(image_size: tuple[int, int]) -> int:
     return max(1, round(max(image_size) / STUFF_SIDE_PX))
 
 
+def thinned_stuff(images: np.ndarray) -> np.ndarray:
+    """The pixels of images, (..., H, W), at which stuff is kept."""
+    return images[(..., *thinned(stuff_step(images.shape[-2:])))]
+
+
 def stuff_size(image_size: tuple[int, int]) -> tuple[int, int]:
     """Size, (h, w), of images of stuff."""
     step = stuff_step(image_size)

@@ -7,7 +7,7 @@ import numpy as np
 from scipy import ndimage
 
 from sceneprior.core.classes import VOID
-from sceneprior.core.shards import RoomViews, Sightings
+from sceneprior.core.shards import RoomViews, Sightings, thinned_stuff
 
 MIN_BOX_SIDE_PX = 4
 """Longest side of a mask's box, in pixels, at which the mask still counts as not visible: an object
@@ -29,16 +29,27 @@ class Observations(Sightings):
     """Indices of the given objects that are visible in no view."""
 
     def room_views(
-        self, room_id: str, world_to_camera: np.ndarray, intrinsics: np.ndarray
+        self,
+        room_id: str,
+        world_to_camera: np.ndarray,
+        intrinsics: np.ndarray,
+        stuff: np.ndarray | None = None,
     ) -> RoomViews:
-        """Convert to the views of a room in a shard; `intrinsics` may be (3, 3) for all views."""
+        """Convert to the views of a room in a shard; `intrinsics` may be (3, 3) for all views.
+
+        `stuff` has indices into `STUFF` at the pixels of `thinned_stuff`; it is kept where no
+        object is, and not at all if none is known.
+        """
         views, height, width = self.instance_ids.shape
+        if stuff is not None:
+            stuff = stuff * (thinned_stuff(self.instance_ids) == 0) if stuff.any() else None
         return RoomViews(
             **{item.name: getattr(self, item.name) for item in fields(Sightings)},
             room_id=room_id,
             world_to_camera=world_to_camera.astype(np.float32),
             intrinsics=np.array(np.broadcast_to(intrinsics, (views, 3, 3)), dtype=np.float32),
             image_size=(height, width),
+            stuff=stuff,
         )
 
 

@@ -26,7 +26,7 @@ from data_prep.inspection.projection import boxes_around, hull_of
 from data_prep.public.rooms import FramedRoom, prepare_room
 from data_prep.public.source import PublicSource, open_reader
 from data_prep.upright import own_sides
-from sceneprior.core.classes import label_set
+from sceneprior.core.classes import STUFF, label_set
 from sceneprior.core.geometry.turns import quarter_rotation
 from sceneprior.core.ground_truth import reference_scenes
 
@@ -67,6 +67,16 @@ def check(made, room, axes, origin, slack_px=0.0):
         sizes = [np.ptp(points, axis=0) for points in corners]
         np.testing.assert_allclose(made.truth.centers_m[:2], centers, atol=1e-5)
         np.testing.assert_allclose(made.truth.sizes_m[:2], sizes, atol=1e-5)
+
+
+def check_stuff(made, seen):
+    """Pixels of the floor and the wall are known in each view, and nothing is where furniture is.
+
+    `seen` are the true ids of the views.
+    """
+    assert made.views.image_size == seen.shape[1:] and max(seen.shape) < 240, "none is thinned"
+    expected = np.select([seen == 11, seen == 12], [STUFF.index("floor"), STUFF.index("wall")])
+    np.testing.assert_array_equal(made.views.stuff, expected)
 
 
 def test_blenderproc_is_mirrored_back_to_3d_front(room, tmp_path):
@@ -120,6 +130,10 @@ def test_hypersim_has_asset_units_and_tilted_image_planes(room, tmp_path, shifts
     # (x, y, z) -> (y, z, x); the origin is below the middle of bed and chair.
     # With both shifts the grid is skewed; straightening moves pixels by up to half of one.
     check(made, room, (1, 2, 0), (0.05, 0, 0.2), slack_px=0.5 * all(shifts))
+    if not any(shifts):
+        kept = made.views.instance_ids == 0
+        assert set(np.unique(made.views.stuff[kept])) == {STUFF.index("floor"), STUFF.index("wall")}
+    assert not made.views.stuff[made.views.instance_ids > 0].any()
     assert made.truth.height_m == pytest.approx(2.5)
 
 
@@ -131,6 +145,7 @@ def test_structured3d_has_millimetres_a_floor_and_the_authors_split(room, tmp_pa
     one = made["scene_00007_480"]
     assert classes_of(one.views, NAMES) == ["bed", "chair"]
     check(one, room, (1, 2, 0), (-0.1, 0, 0.05))
+    check_stuff(one, np.stack([room.ids(k) for k in range(len(room.poses))]))
     outline = [(y + 0.1, x - 0.05) for x, y in [(-3, -3.2), (3.1, -3.2), (3.1, 3), (-3, 3)]]
     np.testing.assert_allclose(one.truth.floor_m, outline, atol=1e-5)
     assert one.truth.height_m == pytest.approx(2.6)
@@ -153,6 +168,7 @@ def test_scannetpp_is_drawn_from_its_annotated_mesh(room, tmp_path, poses):
         ids = room.ids(1)
         for number, thing in ((1, 3), (2, 300), (3, 7), (0, 11), (0, 12), (3, 0)):
             assert (made.views.instance_ids[1][ids == thing] == number).all()
+        check_stuff(made, np.stack([room.ids(k) for k in range(len(room.poses))]))
 
 
 def test_masks_are_shrunk_with_their_cameras(room, tmp_path):

@@ -5,7 +5,7 @@ import pytest
 
 from data_prep.public.nyu40 import NYU40, ids_and_classes
 from data_prep.scannet.labels import SHELL
-from sceneprior.core.classes import label_set
+from sceneprior.core.classes import STUFF, label_set
 from sceneprior.core.errors import InputError
 
 
@@ -21,7 +21,7 @@ def one_by_one(instances, semantics):
         own = [max(int(s), 0) for s in semantics[instances == instance]]
         best = max(sorted(set(own)), key=own.count)
         classes[instance + 1] = NYU40[best - 1] if best else "void"
-    ids = np.zeros_like(instances)
+    ids, stuff = np.zeros_like(instances), np.zeros_like(instances)
     for place in np.ndindex(instances.shape):
         if instances[place] >= 0:
             number = instances[place] + 1
@@ -29,17 +29,20 @@ def one_by_one(instances, semantics):
         else:
             kind = semantics[place]
             ids[place] = 0 if kind > 0 and NYU40[kind - 1] in SHELL else -1
-    return ids, {k: name for k, name in classes.items() if name not in SHELL}
+        name = NYU40[semantics[place] - 1] if semantics[place] > 0 else ""
+        stuff[place] = STUFF.index(name) if name in STUFF else 0
+    return ids, {k: name for k, name in classes.items() if name not in SHELL}, stuff
 
 
 def test_ids_and_classes_match_the_rule(numbers):
     for _ in range(20):
         instances = numbers.integers(-1, 6, (2, 5, 7))
         semantics = numbers.choice([-1, 0, 1, 2, 5, 11, 20, 40], (2, 5, 7))
-        ids, classes = ids_and_classes(instances, semantics, "scene")
+        ids, classes, stuff = ids_and_classes(instances, semantics, "scene")
         expected = one_by_one(instances, semantics)
         np.testing.assert_array_equal(ids, expected[0])
         assert classes == expected[1]
+        np.testing.assert_array_equal(stuff, expected[2])
 
 
 def test_ids_of_other_images_are_refused():

@@ -4,6 +4,7 @@ import pytest
 from scan_files import TABLE, write_table
 
 from data_prep.scannet.labels import read_labels
+from sceneprior.core.classes import STUFF
 from sceneprior.core.errors import InputError
 
 
@@ -16,6 +17,9 @@ def test_raw_categories_become_the_nineteen_classes(labels):
     assert labels.knows("backpack") and not labels.knows("never heard of")
     assert labels.is_shell("wall") and labels.is_shell("floor")
     assert not labels.is_shell("backpack") and not labels.is_shell("never heard of")
+    for category in ("wall", "floor", "backpack", "never heard of"):
+        name = category if labels.is_shell(category) else "unknown"
+        assert STUFF[labels.stuff(category)] == name
 
 
 def test_the_last_row_of_a_category_wins(tmp_path):

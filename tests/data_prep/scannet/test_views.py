@@ -20,7 +20,7 @@ from scan_files import (
 from data_prep.inspection.projection import box_iou_2d
 from data_prep.scannet.scans import FULL_SIZE, QUARTER_SIZE, ScanSettings, read_scan
 from data_prep.scannet.views import instance_images, prepare_scan
-from sceneprior.core.classes import label_set
+from sceneprior.core.classes import STUFF, label_set
 from sceneprior.render.offscreen.zbuffer import rasterize
 
 BITS = (np.arange(8)[:, None] >> np.arange(3)) & 1
@@ -166,12 +166,13 @@ def test_the_shell_touches_everything_and_hides_nothing(scan, labels):
     assert room.views.mask_pixels.tolist() == [[750, 300]]
     np.testing.assert_array_equal(room.views.instance_ids[0] == 3, image == 4)
     np.testing.assert_array_equal(room.views.instance_ids[0] == 0, image <= 1)
+    np.testing.assert_array_equal(room.views.stuff[0], (image == 1) * STUFF.index("floor"))
 
 
 def test_ids_without_an_object_hide_and_are_told(scan, labels):
     image = picture((2, 5, 10, 30, 40), (90, 30, 20, 40, 30), (255, 70, 0, 80, 10))
     made = painted(scan, labels, {0: image})
-    (ids,), unlisted = instance_images(made)
+    (ids,), _, unlisted = instance_images(made)
     assert unlisted == [89, 254]
     assert ids[20, 35] == 5 and ids[20, 10] == 2  # four instances
     room = prepare_scan(made)
@@ -215,6 +216,6 @@ def test_a_long_recording_takes_little_memory(scan, labels):
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert len(room.views.visible) == 67
-    # Twice the stored images (before and after numbering, 67 x 242 x 324 bytes), a full-size mask
-    # or two (1.25 MB) and the archive's names.
-    assert peak < 2 * 67 * 242 * 324 + 8e6
+    # Three times the stored images (ids before and after numbering, and stuff, 67 x 242 x 324 bytes
+    # each), a full-size mask or two (1.25 MB) and the archive's names.
+    assert peak < 3 * 67 * 242 * 324 + 8e6
