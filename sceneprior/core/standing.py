@@ -1,7 +1,7 @@
 """Rooms made ready for physics: objects stand on the floor or on other objects, and do not overlap.
 
-Generated rooms come close to this, but furniture may float by a centimetre, and a lifted chair may
-lack a leg or reach into a table. The changes are counted.
+Generated rooms nearly meet these conditions, but furniture may float by a centimetre, and a lifted
+chair may lack a leg or reach into a table. The changes are counted.
 """
 
 import itertools

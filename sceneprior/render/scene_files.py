@@ -94,8 +94,8 @@ FACING = ("class", "yaw_rad", "yaw_confidence")
 
 
 def glb_extras(scene: Scene) -> dict[str, Any]:
-    """What a GLB says of its scene: name, label set, `extra`, and each object's node and class,
-    with its yaw where it is known (docs/conventions.md)."""
+    """Metadata of a scene in its GLB: name, label set, `extra`, and each object's node and class,
+    with its yaw where known (docs/conventions.md)."""
     entries = scene_to_json(scene)["objects"]
     objects = [
         {"node": node} | {key: entry[key] for key in FACING if key in entry}

@@ -33,7 +33,7 @@ class RoomDataset(Dataset):
     max_objects: int
     """Largest number of objects in a room."""
     counted: ClassVar[str]
-    """Name of the things that `max_objects` counts, for messages."""
+    """Plural noun for the objects that `max_objects` counts, for messages."""
     masks: MaskStore | None = None
     """Images to read; if None, batches are made in the training process, on its device."""
 

@@ -34,7 +34,7 @@ def number_array(value: Any) -> np.ndarray:
     """Convert nested lists of numbers to float64.
 
     Raises:
-        TypeError: an entry is a text, null or too large a number.
+        TypeError: an entry is a string, null or too large a number.
         ValueError: rows have different lengths.
     """
     array = np.array(value)
