@@ -100,7 +100,7 @@ class DecodedScenes:
     """Look of each object, that is, its prototype and pose as one index: prototype * 8 + pose
     (`lifted/prototypes.py`). None before the shape decoder has run, and if it predicts meshes."""
     next_looks: Int[Tensor, "rooms objects"] | None = None
-    """Look that each object's shape changes into along a path; None if the room is not on a path."""
+    """Look into which each object changes along a path; None if the room is not on a path."""
     shares: Float[Tensor, "rooms objects"] | None = None
     """Share of `next_looks` in each object's shape, at least 0 and less than 1."""
 

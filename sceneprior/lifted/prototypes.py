@@ -70,7 +70,7 @@ def choose_prototypes(
     usable: Bool[np.ndarray, " objects"],
     most: int,
 ) -> tuple[Int[np.ndarray, " prototypes"], Bool[np.ndarray, " prototypes"]]:
-    """Choose the objects that become prototypes, and tell which of them are common (`COMMON`).
+    """Choose the objects that become prototypes, and mark the common ones (`COMMON`).
 
     For each class, the object that looks like most of the remaining objects is chosen, again and
     again, until every usable object looks like a prototype. The threshold is `ALIKE`, raised by
@@ -92,8 +92,8 @@ def choose_prototypes(
 def _covering(
     apart: list[tuple[np.ndarray, np.ndarray]], alike: float
 ) -> tuple[Int[np.ndarray, " prototypes"], Bool[np.ndarray, " prototypes"]]:
-    """Rows of the prototypes that `choose_prototypes` finds at the threshold `alike`, and whether
-    they are common; `apart` holds each class's rows and their distances."""
+    """Rows of the prototypes that `choose_prototypes` finds at the threshold `alike`, and which of
+    them are common; `apart` holds each class's rows and their distances."""
     items, common = [], []
     for rows, distance in apart:
         near = (distance <= alike) | np.eye(len(rows), dtype=bool)

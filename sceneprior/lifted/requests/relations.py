@@ -15,7 +15,8 @@ across it |
 | at a wall | the footprint is at most `AT_WALL_M` from a side of the floor |
 | in a corner | the footprint is at most `CORNER_M` from a convex corner of the floor |
 | under | one centre lies in the other's footprint, and the object's top is below the target's \
-bottom or the target is a lamp; under a window: at most `REACH_M` before it, and below its sill |
+bottom or the target is a lamp; under a window: at most `REACH_M` in front of it, and below \
+its sill |
 | near | the footprints are less than `NEAR_M` apart |
 | far from | the centres are more than `FAR_M` apart, beyond which InstructScene has no relation |
 """
@@ -48,7 +49,7 @@ CORNER_M = 0.4
 SECTOR_RAD = np.pi / 4
 """Half the angle of a sector."""
 REACH_M = 0.5
-"""Largest distance from a window for `under`."""
+"""Maximum distance in front of a window at which an object may be `under` the window."""
 OUTWARD = np.array([(0.0, -1.0), (-1.0, 0.0), (0.0, 1.0), (1.0, 0.0)])
 """Direction (x, z) towards the sides low z, low x, high z and high x (`side_of`)."""
 

@@ -1,5 +1,5 @@
-"""Search for the place of a required object when the sampler draws none that fits: candidates from
-the whole room are weighted by the sampler's density."""
+"""Search for a place for a required object when no place that the sampler draws is allowed:
+candidates from the whole room are weighted by the sampler's density."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

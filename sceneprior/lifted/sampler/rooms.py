@@ -17,7 +17,7 @@ from sceneprior.lifted.lifting.dataset import LiftedDataset
 from sceneprior.lifted.prototypes import POSES, Prototypes, turned_looks
 
 GRAZE_M = 0.05
-"""Overlap along an axis up to which an intersection of lifted boxes is put down to their
+"""Overlap along an axis up to which an intersection of lifted boxes is attributed to their
 inaccuracy."""
 SYMMETRIES = 2 * QUARTERS
 """Symmetries of a room: mirrored or not, times the quarter turns; 0 is the untransformed room."""
@@ -26,15 +26,15 @@ LOOSELY = 2.0
 FRAME_M = 0.15
 """Standard deviation of the normal distribution in `frames_of`."""
 SURE_M = 0.03
-"""Largest error of a wall that is a side of a training room's rectangle."""
+"""Maximum standard error of a wall that replaces a side of a training room's rectangle."""
 AT_WALL_M = 0.45
-"""Largest gap between furniture and a wall that is a side of the rectangle; drawn rooms with larger
-gaps are drawn again (`draw.py`)."""
+"""Maximum gap between furniture and such a wall; drawn rooms with larger gaps are drawn again
+(`draw.py`)."""
 FACING = 0.98
-"""Smallest cosine between a wall's normal and the axis that its side lies on: 11 degrees."""
+"""Minimum cosine between a wall's normal and that of the rectangle's side: 11 degrees."""
 PLAUSIBLE_SHARE = 0.2
-"""Share of the training rooms with both classes in which the two must intersect for this to be
-considered intended. Lifted boxes of chairs intersect each other in a seventh of the rooms, true
+"""Share of the training rooms with both classes in which the two must intersect for intersections
+to count as intended. Lifted boxes of chairs intersect each other in a seventh of the rooms, true
 boxes in none."""
 
 
@@ -148,8 +148,8 @@ def rectangles_of(rooms: RoomBoxes) -> Float[Tensor, "rooms 4"]:
 
 
 def _walls_of(walls: Sequence[Wall], rectangle_m: np.ndarray) -> list[float]:
-    """One row of `RoomBoxes.walls_m`: at each side of the rectangle around the furniture, the
-    nearest wall that faces it and is opposite to a part of it."""
+    """One row of `RoomBoxes.walls_m`: for each side of the rectangle around the furniture, the
+    nearest wall that faces this side and overlaps with it along its direction."""
     middle, half = rectangle_m[:2], rectangle_m[2:] / 2
     found = []
     for outwards in np.array([[0, -1], [-1, 0], [0, 1], [1, 0]]):
