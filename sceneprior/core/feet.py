@@ -12,8 +12,8 @@ from sceneprior.core.scene import Mesh, SceneObject, Solid, Textured
 CONTACT_M = 1e-3
 """Height above the lowest point up to which a body touches the floor."""
 MARGIN = 0.2
-"""Minimum distance of the centre of mass from the edge of the support polygon, relative to its
-distance from the outline of the object seen from above."""
+"""Minimum distance of the centre of mass from the edge of the support polygon, as a share of the
+distance of the centre of mass from the outline of the object seen from above."""
 WIDE_M = 0.05
 """Width of a foot."""
 LOWER = 0.2

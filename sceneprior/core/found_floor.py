@@ -17,7 +17,7 @@ from sceneprior.core.wall_lines import BARRIER, COARSE_M, FLOOR, Door, Wall, fin
 CELL_M = 0.03
 """Side of the cells in which the seen floor is collected."""
 SEEN_SHARE = 0.1
-"""Share of a region between walls that must be seen floor for the region to be floor."""
+"""Share of a region between walls that must be visible floor for the region to count as floor."""
 
 OPENED = 4
 """Iterations of the binary opening that removes narrow strips from the area behind walls."""

@@ -152,7 +152,7 @@ class RoomBoxes(Batch):
     """Rectangle in which each room was furnished: centre x, z and extents x, z; None if unknown."""
     walls_m: Float[Tensor, "rooms 4"] | None = None
     """Distances of the walls near the furniture from the origin, outwards, at low z, low x, high z
-    and high x; NaN where no wall is known. None if no wall is."""
+    and high x; NaN where no wall is known. None if no walls are known."""
 
     def split(self, rooms: int) -> list["RoomBoxes"]:
         """Split into batches of at most `rooms` rooms, without ids."""

@@ -44,8 +44,8 @@ def save_scene(scene: Scene, path: Path, shell: ShellName = "none") -> None:
     of the whole room. 3D formats keep the axes and the unit of the room frame: y up, metres.
 
     Args:
-        shell: With `walls`, models have nodes `floor`, `wall_0` and so on, and `ceiling`; with
-            `floor`, the first alone.
+        shell: With `walls`, 3D files also have nodes `floor`, `wall_0` and so on, and `ceiling`;
+            with `floor`, only the node `floor`.
 
     Raises:
         InputError: the path has another suffix.

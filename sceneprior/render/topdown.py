@@ -35,7 +35,7 @@ class TopDownProtocol:
     camera_height_m: float = 10.0
     """The camera's height above the floor; nothing above it is drawn."""
     background: tuple[int, int, int] = BACKGROUND
-    """RGB of pixels without an object. The floor is not drawn: not all methods make one."""
+    """RGB of pixels without an object. The floor is not drawn: not all methods generate one."""
 
     @property
     def metres_per_pixel(self) -> float:

@@ -109,7 +109,7 @@ def check_size(size: tuple[int, int], where: str) -> None:
 def paint(masks: Iterable[tuple[int, np.ndarray]], size: tuple[int, int]) -> np.ndarray:
     """Image of ids, (height, width) int32, of (id, mask) pairs whose masks may overlap.
 
-    The mask with fewer pixels is in front, like a cup on a table; of equally large ones, the later.
+    The mask with fewer pixels is in front, like a cup on a table; in a tie, the later mask is.
     """
     ids = np.zeros(size, dtype=np.int32)
     pixels_of_front = np.full(size, np.iinfo(np.int32).max, dtype=np.int32)

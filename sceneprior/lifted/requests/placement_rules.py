@@ -20,7 +20,7 @@ counts as standing with its back to this side."""
 WALL_M = 0.3
 """Maximum distance of the middle of such a back from a wall."""
 BEFORE_WINDOWS = ("lamp", "plant")
-"""Words in the names of classes that may stand or hang before a window."""
+"""Words in the names of classes that may stand or hang in front of a window."""
 
 
 class PlacementRules:

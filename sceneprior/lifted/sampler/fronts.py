@@ -25,7 +25,7 @@ BESIDE = 0.3
 """Share of the smaller of two footprints' extents that must overlap, along one axis, for one object
 to stand in front of, behind or beside the other."""
 STRIP = 0.2
-"""Part of a prototype's extent whose height counts as that of its side."""
+"""Depth of the strip, as a share of a prototype's extent, whose height is that of a side."""
 
 
 def find_fronts(
