@@ -21,7 +21,7 @@ VIEW_ARRAYS: dict[str, tuple[str, tuple[_Side, ...]]] = {
 }
 """Type and shape of each array of a room; T views, n objects, images of H x W pixels."""
 IMAGES: dict[str, tuple[_Side, ...]] = {"instance_ids": ("T", "H", "W"), "stuff": ("T", "h", "w")}
-"""Shape of each array of images; `stuff` is optional, and h x w its own size."""
+"""Shape of each array of images; `stuff` is optional, and has its own size, h x w."""
 TRUTH_ARRAYS: dict[str, tuple[str, tuple[_Side, ...]]] = {
     "object_class": ("int16", ("m",)),
     "centers_m": ("float32", ("m", 3)),

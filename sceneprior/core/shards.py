@@ -77,8 +77,8 @@ class RoomViews(Sightings):
     """(H, W)."""
     stuff: np.ndarray | None = None
     """(T, h, w) uint8, index into `STUFF`: floor, walls, doors, windows and ceiling, thinned by
-    `stuff_step`; 0 where an object or anything else is, or nothing is known. None if the source
-    does not name them, or if the images were not read."""
+    `stuff_step`; 0 for objects, other surfaces and unknown pixels. None if the source does not name
+    them, or if the images were not read."""
     turned_deg: float = 0.0
     """Angle about +y by which data preparation rotated the room, so that its walls run along x and
     z."""

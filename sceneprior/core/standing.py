@@ -24,8 +24,8 @@ TOUCHING_M = 5e-4
 FLOOR_M = 0.3
 """Maximum height of the lower face of objects that are always set on the floor."""
 RESTS_M = 0.15
-"""Maximum vertical distance by which an object above `FLOOR_M` is moved onto the top of another
-object; without an object in reach, it is set on the floor, too."""
+"""Maximum vertical distance by which an object above `FLOOR_M` is moved onto another object. If no
+object is within this distance, it is set on the floor, too."""
 SLABS = 8
 """Number of slabs into which a body that is a mesh is cut."""
 STEP_M, REACH_M = 0.05, 2.0

@@ -224,8 +224,7 @@ class LookDecoder(ShapeModule):
         return blend_parts(here, there, share)
 
     def looks(self, codes: Float[Tensor, "*objects codes"]) -> Int[Tensor, "*objects"]:
-        """The look whose code is nearest, the first of equal ones; 0 if there are no prototypes
-        yet."""
+        """The look whose code is nearest, in a tie the first; 0 before prototypes are set."""
         known = (self.object_class != self.unknown).repeat_interleave(POSES).nonzero()[:, 0]
         if not len(known):
             return torch.zeros(codes.shape[:-1], dtype=torch.int64, device=codes.device)
@@ -292,7 +291,7 @@ def _box_m(decoded: DecodedScenes, room: int, item: int) -> Float[np.ndarray, "6
 def _solids_in(parts: Parts, box_m: Float[np.ndarray, "6"]) -> tuple[Solid, ...]:
     """Parts without mirror images, in the frame of a box (centre, full extents), as solids."""
     placed_m = parts.ends.swapaxes(1, 2) * box_m[3:] + box_m[:3]
-    # A part in the middle is its own mirror image, to rounding.
+    # A part in the middle is its own mirror image, up to rounding.
     _, first = np.unique(placed_m.round(5), axis=0, return_index=True)
     low_m, high_m = placed_m.swapaxes(0, 1).tolist()
     return tuple(

@@ -138,9 +138,9 @@ def pose_distances(
     objects: tuple[Bool[np.ndarray, "objects x y z"], Float[np.ndarray, "objects 3"]],
     offered: tuple[Bool[np.ndarray, "offered x y z"], Float[np.ndarray, "offered 3"]],
 ) -> Float[np.ndarray, "objects offered poses"]:
-    """Distance (see `ALIKE`) of each object from each offered object, in each pose of the latter.
+    """Distance (see `ALIKE`) of each object from each `offered` object in each of its poses.
 
-    Both are given by their grids and their extents in metres.
+    Objects are given by their grids and their extents in metres.
     """
     (coarse, log_sizes), (offered_coarse, offered_sizes) = (
         (pooled(grids, COARSE), np.log(sizes_m)) for grids, sizes_m in (objects, offered)

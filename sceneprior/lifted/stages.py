@@ -19,7 +19,7 @@ from sceneprior.training.steps import batch_seed, full_precision
 
 
 class LiftedStage(LatentStage):
-    """The layout loss against lifted 3D boxes, and the distance to the lifted shapes."""
+    """Trains with the layout loss against lifted 3D boxes, and the distance to lifted shapes."""
 
     stage: LiftedStageConfig
     loss: LiftedLossConfig

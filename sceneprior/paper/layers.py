@@ -40,7 +40,7 @@ class ShapeModule(nn.Module, ABC):
     """A shape decoder: maps an object's feature to its shape, and the shape to a mesh."""
 
     faces: Tensor | None
-    """(faces, 3) triangles, if all of its meshes share one topology; else None."""
+    """(faces, 3) triangles, if all meshes of the decoder share them; else None."""
 
     @abstractmethod
     def add_shapes(

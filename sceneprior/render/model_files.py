@@ -21,12 +21,12 @@ TEXTURES = (
 def load_parts(
     path: Path, file_type: str | None = None, with_materials: bool = True
 ) -> dict[str, Textured]:
-    """The meshes of a GLB or an OBJ by node name, placed by their nodes.
+    """The meshes of a GLB or an OBJ by node name, with the transforms of their nodes applied.
 
-    A damaged file raises any exception.
+    A damaged file may raise any exception.
 
     Args:
-        file_type: Format of the file; None for that of its suffix.
+        file_type: Format of the file; None uses its suffix.
     """
     import trimesh
 

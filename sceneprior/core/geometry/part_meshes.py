@@ -30,7 +30,7 @@ def surface_of_parts(
 
     The mesh is closed: every edge belongs to two triangles.
     """
-    from manifold3d import Manifold, OpType  # imported here: reading a scene needs none
+    from manifold3d import Manifold, OpType  # imported here: reading a scene does not need it
 
     solids = [_solid(kind, ends) for kind, ends in parts.solids()]
     united: Manifold = Manifold.batch_boolean(solids, OpType.Add)

@@ -86,7 +86,7 @@ def read_coco(path: Path) -> tuple[np.ndarray, dict[int, str]]:
 
 
 def read_coco_json(path: Path) -> dict[str, Any]:
-    """Read a JSON that is an object, as all COCO's files of annotations are."""
+    """Read a JSON of COCO annotations; its top level must be an object."""
     data = read_json(path)
     if not isinstance(data, dict):
         raise InputError(

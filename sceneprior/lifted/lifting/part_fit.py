@@ -93,7 +93,7 @@ def _one_more(
 
 
 def _changes(guess: Guess, hull: Bool[np.ndarray, "x y z"], curved: bool) -> Iterator[Change]:
-    """Changes to try: another kind of a part; a part mirrored with its own or a quarter of its
+    """Changes to try: a different kind for a part; a part mirrored with its own or a quarter of its
     width; a part split in two, each fitted to the hull; a part extended to the floor; legs or
     panels below a part; a new part around an uncovered piece of the hull."""
     new = len(guess.kinds)

@@ -1,6 +1,6 @@
 """Relations that can be requested: a closed list, on axis-aligned boxes with a front.
 
-InstructScene (Lin and Mu, ICLR 2024; its `compute_loc_rel`) knows left, right, front and behind as
+InstructScene (Lin and Mu, ICLR 2024; its `compute_loc_rel`) has left, right, front and behind as
 sectors of 90 degrees between centres on the floor, up to 3 m, "closely" below 1 m, and above and
 below for an object whose footprint contains the other's centre. InstructScene's sectors follow the
 world's axes; here they follow the front of an object, since "in front of the bed" depends on the
@@ -43,7 +43,7 @@ NEAR_M = 1.0
 """InstructScene's threshold of "closely", applied to footprints in place of centres: the centres of
 a double bed and of a nightstand that touches it are 1.3 m apart."""
 FAR_M = 3.0
-"""InstructScene's largest distance of a relation, between centres."""
+"""InstructScene's maximum distance between the centres of related objects."""
 AT_WALL_M = 0.2
 CORNER_M = 0.4
 SECTOR_RAD = np.pi / 4

@@ -85,7 +85,7 @@ def read_sentence(text: str, known: Sequence[str], label_set: str) -> Sentence:
     reader = _Reader(tokens, known, label_set)
     reader.read()
     if reader.strange:
-        # Words of a relation are listed only if all are: usually the unknown word is its target.
+        # Relation words are left out if another word is unknown: usually it is their target.
         fine = {*ARTICLES, *RELATION_WORDS}
         listed = [word for word in reader.strange if word not in fine] or reader.strange
         words = ", ".join(f"'{word[:40]}'" for word in dict.fromkeys(listed))

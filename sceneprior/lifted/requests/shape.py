@@ -194,7 +194,7 @@ def inner_rectangles(polygon: shapely.Polygon) -> Float[np.ndarray, "rectangles 
         covered[x1[:, None], z1] - covered[x0[:, None], z1]
         - covered[x1[:, None], z0] + covered[x0[:, None], z0]
     )  # fmt: skip
-    full = np.zeros((len(x) + 2,) * 2 + (len(z) + 2,) * 2, dtype=bool)  # from x, to x, z and z
+    full = np.zeros((len(x) + 2,) * 2 + (len(z) + 2,) * 2, dtype=bool)  # from x, to x, from z, to z
     cells_within = (x1 - x0)[:, None] * (z1 - z0)
     full[x0[:, None] + 1, x1[:, None] + 1, z0 + 1, z1 + 1] = inside == cells_within
     inner = full[1:-1, 1:-1, 1:-1, 1:-1]

@@ -10,8 +10,8 @@ from sceneprior.core.mixtures import draw_index
 END = 0
 """Class that ends a room's list: void, which no listed object has."""
 MANY = 3
-"""Number of bits that also encode the count of a class, "at least 1", "at least 2" and so on,
-because the first object of a class is more informative than the next ones."""
+"""Number of bits ("at least 1", "at least 2" and so on) that encode the count of a class, besides
+the count itself: the first object of a class is more informative than the next ones."""
 
 
 class Contents(nn.Module):

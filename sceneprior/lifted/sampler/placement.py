@@ -46,7 +46,7 @@ class Placement(nn.Module):
     of the rectangle, in the middle of the rectangle, and in the middle of the floor. Every object
     already placed gives anchors adjacent to it, flush with its sides, centred on it, and apart from
     it. So an object can stand flush with a wall along one axis and adjacent to another object along
-    the other. The weight of an anchor depends on what an object there would stand next to
+    the other. The weight of an anchor depends on the neighbours of an object at the anchor
     (`AxisScore`).
 
     Args:

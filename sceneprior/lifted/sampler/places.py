@@ -51,7 +51,7 @@ def ramps(lengths_m: Float[Tensor, "*batch n"], knots_m: tuple[float, ...]) -> T
 
 
 class Anchors(NamedTuple):
-    """Positions along an axis, and features of what an object at each would stand next to."""
+    """Positions along an axis, with features of the neighbours of an object at each position."""
 
     at_m: Float[Tensor, "rooms anchors"]
     exists: Bool[Tensor, "rooms anchors"]

@@ -63,7 +63,7 @@ class SamplerRooms:
     def see_looks(self, prototypes: Prototypes) -> "SamplerRooms":
         """Set `rooms`, in which every object has a look, and return this data set.
 
-        Only common prototypes are used, since odd ones are often badly lifted.
+        Only common prototypes are used, since odd prototypes are often badly lifted.
         """
         lifted, prototypes = self._lifted, prototypes.common_alone()
         counts = [len(room.explained) for room in lifted.boxes]
@@ -172,8 +172,8 @@ def _walls_of(walls: Sequence[Wall], rectangle_m: np.ndarray) -> list[float]:
 
 
 def frames_of(rooms: RoomBoxes, generator: torch.Generator) -> Float[Tensor, "rooms 4"]:
-    """`rectangles_of`, with each side moved outwards: to the wall if it is known, otherwise by the
-    absolute value of a normal number.
+    """`rectangles_of` with each side moved outwards: to the wall if known, otherwise by the
+    absolute value of a normal random number.
 
     The exact extents would reveal when a room is complete, since the last object touches them, and
     sampled furniture never fits a rectangle exactly. So noise of standard deviation `FRAME_M` is
@@ -232,8 +232,8 @@ def turned_rooms(rooms: RoomBoxes, symmetry: Int[Tensor, " rooms"]) -> RoomBoxes
 
 
 def own_sides(looks: Int[Tensor, "*batch"]) -> Int[Tensor, "*batch 4"]:
-    """The side of the room at which each of the four sides of a look's prototype is; sides are 0 to
-    3 for low z, low x, high z, high x."""
+    """Side of the room towards which each of the four sides of a look's prototype points; sides are
+    0 to 3 for low z, low x, high z, high x."""
     pose, own = (looks % POSES).unsqueeze(-1), torch.arange(QUARTERS, device=looks.device)
     # Mirroring (x reversed) comes before the turn, and reverses the direction of sides.
     return (pose % QUARTERS + torch.where(pose >= QUARTERS, -own, own)) % QUARTERS

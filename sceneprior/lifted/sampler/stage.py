@@ -50,7 +50,7 @@ squared."""
 
 
 class SamplerStage(lightning.LightningModule):
-    """Maximum likelihood of rooms, each in a random order of its objects and one of eight
+    """Trains by maximum likelihood of rooms, each in a random order of its objects and one of eight
     symmetries."""
 
     def __init__(
