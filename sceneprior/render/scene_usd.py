@@ -80,7 +80,7 @@ def _define_mesh(
     color: np.ndarray | None,
     origin_m: tuple[float, float, float],
 ) -> Any:
-    """A mesh prim, relative to `origin_m`; without a colour, one that is not drawn."""
+    """A mesh prim, relative to `origin_m`; without a colour, it is not drawn."""
     from pxr import Gf, UsdGeom, Vt
 
     prim = UsdGeom.Mesh.Define(stage, path)

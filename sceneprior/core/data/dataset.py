@@ -159,7 +159,7 @@ def allowed_views(
 ) -> Int64[np.ndarray, " views"]:
     """Indices of a room's views that training may use: a random share, determined by `seed`.
 
-    If `held_out`, the indices of the other views instead.
+    With `held_out`, return the indices of the other views.
     """
     keep = max(1, round(fraction * count))
     order = np.random.default_rng([seed, room]).permutation(count)

@@ -45,8 +45,8 @@ def search(
     upcoming: Sequence[int],
     draws: np.random.Generator,
 ) -> tuple[int, Float[Tensor, "6"]] | str:
-    """The look, in one of four rotations, and the box of an allowed place; or the reason why there
-    is none.
+    """Find an allowed place: return the look, in one of four rotations, and the box, or the reason
+    why no place was found.
 
     Importance sampling: one of at most `COMPARED` allowed places is drawn in proportion to the
     sampler's density.

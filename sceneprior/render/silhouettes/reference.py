@@ -17,8 +17,8 @@ MIN_AREA_PX2 = 1e-12
 """Twice the area in px**2 up to which a projected face counts as degenerate and is not drawn."""
 
 PIECE_PX = 4.0
-"""Maximum length in pixels of the equal pieces into which an edge is cut. Each piece is either
-wholly part of the outline or not part of it."""
+"""Maximum length in pixels of the equal pieces into which an edge is cut. A piece is either wholly
+on the outline or not on it."""
 
 ASIDE_PX = 1e-3
 """Distance in pixels between the middle of a piece and a test point beside it. The piece is part of

@@ -85,8 +85,8 @@ def render_scene(
             masks, see `cpu/compositing.py`. `alone` draws each object as if there were no others.
         drawn: True for the objects to draw; the others get empty masks and occlude nothing. None
             draws all objects.
-        backend: `cpu` (Numba), `cuda` (Triton), `reference` (plain torch), or `auto`: the fast
-            backend of the tensors' device, or else `reference`.
+        backend: `cpu` (Numba), `cuda` (Triton), `reference` (plain torch), or `auto`: `cpu` or
+            `cuda` by the device of the vertices, on other devices `reference`.
 
     Raises:
         ValueError: an unknown mode, a sigma that is not positive, a vertex index out of range, or a
