@@ -25,8 +25,8 @@ LABEL_SETS: dict[str, tuple[str, ...]] = {
     ),
 }  # fmt: skip
 """Label sets of the paper's supplement A; `refridgerator` is ScanNet's spelling."""
-# Room types that the paper does not have. The name of a label set identifies the data of a prior,
-# so each of these has its own name, even if it has the same classes as another.
+# Room types that are not in the paper. The name of a label set identifies the data of a prior, so
+# each room type has its own name, even if its classes are those of another.
 LABEL_SETS |= {
     "front3d_dining": LABEL_SETS["front3d_living"],
     "front3d_library": LABEL_SETS["front3d_living"],
@@ -105,7 +105,7 @@ def class_colors(count: int) -> np.ndarray:
 
 
 def unknown_class(label: str, known: Sequence[str]) -> InputError:
-    """The error that a class was asked for which the training rooms of a run do not have."""
+    """Error for a requested class that the training rooms of a run do not contain."""
     return InputError(
         f"'{label}' is not a class of this run's training rooms; choose from {', '.join(known)}."
     )

@@ -22,7 +22,7 @@ CONCAVITY = 0.05
 MOST_COMPONENTS = 200
 """Largest number of closed components into which a mesh is divided."""
 SEARCH = {"mcts_iterations": 60, "mcts_nodes": 10, "resolution": 1000}
-"""A shorter search than CoACD's default: 0.5 s of CPU time per object in place of 1.3 s, with the
+"""CoACD settings that take 0.5 s of CPU time per object instead of 1.3 s with its defaults, for the
 same number of parts."""
 LEAST_M3 = 1e-9
 """Volume assumed for flat bodies."""
@@ -32,9 +32,9 @@ _FILL = {
 
 
 def support_of(item: SceneObject) -> Literal["ground", "wall", "ceiling"]:
-    """What an object is expected to rest on, by its class: lamps of the classes `HUNG` on the
-    ceiling, pieces of the classes `MOUNTED` on a wall if their lower face is above 0.4 m, and all
-    others on the ground or on an object."""
+    """Support of an object, by its class: the ceiling for lamps of the classes `HUNG`; a wall for
+    the classes `MOUNTED` if their lower face is above 0.4 m; otherwise the ground, which includes
+    other objects."""
     if item.label in HUNG:
         return "ceiling"
     bottom_m = item.center_m[1] - item.size_m[1] / 2
@@ -72,8 +72,8 @@ def convex_parts(mesh: Mesh) -> tuple[Mesh, ...]:
 
 
 def closed_components(mesh: Mesh) -> list[Mesh]:
-    """The connected components of a mesh, if all are closed, with outward faces, and there are few;
-    else the whole mesh."""
+    """Split a mesh into its connected components if there are few and all are closed, with outward
+    faces; otherwise return the whole mesh."""
     import trimesh
 
     faces = np.asarray(mesh.faces)
@@ -95,7 +95,7 @@ def closed_components(mesh: Mesh) -> list[Mesh]:
 
 
 def _divided(mesh: Mesh) -> tuple[Mesh, ...]:
-    """The convex hull of a mesh that is nearly convex, else the mesh's decomposition by CoACD."""
+    """The convex hull of a nearly convex mesh; otherwise its decomposition by CoACD."""
     coacd = _coacd()
     hull = Mesh(*convex_surface(np.asarray(mesh.vertices_m, dtype=np.float64)))
     if coacd is None or not len(hull.faces):
@@ -135,7 +135,7 @@ def mesh_of(body: Solid | Mesh) -> Mesh:
 
 
 def volume_and_centroid(body: Solid | Mesh) -> tuple[float, Float[np.ndarray, "3"]]:
-    """Volume in cubic metres, and centroid, of a body."""
+    """Volume of a body in cubic metres, and its centroid."""
     if isinstance(body, Mesh):
         corners = np.asarray(body.vertices_m, dtype=np.float64)[body.faces]
         volumes = np.linalg.det(corners) / 6

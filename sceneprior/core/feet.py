@@ -12,15 +12,15 @@ from sceneprior.core.scene import Mesh, SceneObject, Solid, Textured
 CONTACT_M = 1e-3
 """Height above the lowest point up to which a body touches the floor."""
 MARGIN = 0.2
-"""Minimum distance of the centre of mass from the edge of the support polygon, relative to its
-distance from the outline of the object seen from above."""
+"""Minimum distance of the centre of mass from the edge of the support polygon, as a share of the
+distance of the centre of mass from the outline of the object seen from above."""
 WIDE_M = 0.05
 """Width of a foot."""
 LOWER = 0.2
 """Lower part of a body, as a share of its height, that a foot may support."""
 HIGH = 0.3
-"""Cost of a metre between the floor and a body, relative to a metre between the corner and the
-foot, in the choice of the body that a foot supports."""
+"""Weight of the height of a body above the floor, relative to its horizontal distance from the
+corner, when choosing the body that a foot supports."""
 INTO_M = 0.01
 """Length by which a foot reaches into the body above it."""
 
@@ -81,8 +81,8 @@ def _feet(bodies: tuple[Solid | Mesh, ...]) -> tuple[Solid, ...]:
 def _under(
     clouds: list[Float[np.ndarray, "_ 3"]], at: Float[np.ndarray, "2"], floor_m: float
 ) -> tuple[Float[np.ndarray, "2"], float]:
-    """Position (x, z) and top of the foot of a corner, `at`: it supports the body with the lowest
-    cost, which prefers low bodies near the corner."""
+    """Position (x, z) and top of the foot at a corner, `at`. The foot supports the body with the
+    lowest cost, which favours low bodies near the corner."""
     found = []
     for points in clouds:
         # Only the lower part, because the rim of a round body may be as high as the object.

@@ -80,7 +80,7 @@ def remove_parts(folder: Path) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Check that a file or folder can be written, before work starts whose result goes there.
+    """Check that a file or folder is writable, before work starts whose result goes there.
 
     Raises:
         OSError: it cannot be written; `filename` is `path`.

@@ -1,7 +1,7 @@
-"""Finds a room's floor, walls and doors from masks of stuff: what they show, and what they imply.
+"""Finds a room's floor, walls and doors from images of stuff (`classes.STUFF`).
 
-Furniture hides parts of floor and walls. `FoundFloor.seen` is certain; `FoundFloor.floor` adds what
-lies between the walls that were found.
+Furniture hides parts of floor and walls. `FoundFloor.seen` is the floor that views show;
+`FoundFloor.floor` adds the hidden floor, inferred from the walls that were found.
 """
 
 from typing import NamedTuple
@@ -17,31 +17,31 @@ from sceneprior.core.wall_lines import BARRIER, COARSE_M, FLOOR, Door, Wall, fin
 CELL_M = 0.03
 """Side of the cells in which the seen floor is collected."""
 SEEN_SHARE = 0.1
-"""Share of a region between walls that must be seen floor for the region to be floor."""
+"""Share of a region between walls that must be visible floor for the region to count as floor."""
 
 OPENED = 4
-"""Half the width in cells of the strips that do not count as being behind a wall."""
+"""Iterations of the binary opening that removes narrow strips from the area behind walls."""
 
 
 class FoundFloor(NamedTuple):
     """Floor, walls and doors in the plane y = 0; (x, z) in metres."""
 
     seen: shapely.Geometry
-    """Floor that some view shows: it lies within the true floor."""
+    """Floor visible in some view; it lies within the true floor."""
     floor: shapely.Geometry
-    """The floor between the walls that were found, with what furniture hides."""
+    """Floor between the walls that were found, including the floor that furniture hides."""
     walls: tuple[Wall, ...]
     doors: tuple[Door, ...]
 
 
 class _Cells(NamedTuple):
-    """Square cells of the plane y = 0."""
+    """Grid of square cells in the plane y = 0."""
 
     low_m: Float[np.ndarray, "2"]
     seen: Bool[np.ndarray, "x z"]
     """True where some view shows floor."""
     outside: Bool[np.ndarray, "x z"]
-    """True where a wall hides the cell from some view, and none shows floor."""
+    """True for cells that a wall hides from some view and that no view shows as floor."""
 
     @property
     def middles_m(self) -> Float[np.ndarray, "cells 2"]:
@@ -84,7 +84,7 @@ def _look_at_cells(room: RoomViews) -> _Cells:
             (camera[:, 2] > 0.05) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
         )
         at = v[there].astype(int), u[there].astype(int)
-        # A pixel at the edge of the floor shows something else, too.
+        # A pixel at the edge of the floor also covers other surfaces.
         inner = ndimage.binary_erosion(stuff == FLOOR, border_value=1)
         floor[there] |= inner[at]
         wall[there] |= BARRIER[stuff[at]]
@@ -93,7 +93,7 @@ def _look_at_cells(room: RoomViews) -> _Cells:
 
 
 def _polygon_of(cells: _Cells, which: Bool[np.ndarray, "x z"]) -> shapely.Geometry:
-    """Union of some cells."""
+    """Union of the cells selected by `which`."""
     edges = np.diff(np.pad(which, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     rows, starts = np.nonzero(edges == 1)
     _, ends = np.nonzero(edges == -1)
@@ -108,8 +108,8 @@ def _between(
     seen: shapely.Geometry,
     cameras_m: Float[np.ndarray, "views 2"],
 ) -> shapely.Geometry:
-    """Union of the regions, between the lines of all walls, that are seen to be floor or hold a
-    camera."""
+    """Union of the floor regions. The lines of all walls divide the plane into regions; a region is
+    floor if enough of it is seen to be floor, or if it holds a camera."""
     if seen.is_empty:
         return seen
     around = shapely.box(*seen.bounds)
@@ -135,7 +135,7 @@ def _between(
     has_camera = np.bincount(of_cameras, minlength=count) > 0
     shares = floor[of_faces] * CELL_M**2 / shapely.area(faces)
     is_floor = (shares > SEEN_SHARE) & (floor > outside)[of_faces] | has_camera[of_faces]
-    # Narrow strips beside walls come from the size of pixels and cells.
+    # Narrow strips beside walls are artefacts of the size of pixels and cells.
     beyond = ndimage.binary_opening(cells.outside, iterations=OPENED)
     whole = (shapely.union_all(faces[is_floor]) - _polygon_of(cells, beyond)) | seen
     parts = shapely.get_parts(whole)

@@ -51,7 +51,7 @@ def model_categories(folder: Path, option: str = "--future") -> dict[str, str]:
 
 
 def tidy_category(text: str) -> str:
-    """Write a category as in `category_table`: in lower case, and "a / b" as "a/b"."""
+    """Normalise a category as in `category_table`: lower case, and "a/b" for "a / b"."""
     return text.strip().lower().replace(" / ", "/")
 
 

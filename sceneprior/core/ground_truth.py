@@ -33,7 +33,7 @@ def reference_scenes(
 
 
 def known_in_3d(shards: Path, split: str) -> bool:
-    """Test whether a split has rooms, all with ground truth; rooms of posed pictures have none."""
+    """True if a split has rooms, and all have ground truth; rooms of posed pictures have none."""
     return any((Path(shards) / split).glob("*.h5")) and all(
         shard.has_ground_truth(room_id) for shard, room_id in iterate_rooms(shards, split)
     )
@@ -63,8 +63,8 @@ def independent_rooms(
     of all real rooms, and keeps its class, box and position. So every single object is real, but
     the objects of a room are independent of each other.
 
-    `with_meshes` keeps the real meshes, a stronger baseline; otherwise objects are boxes. A room
-    has the floor and the ceiling of the real room whose number of objects it has.
+    `with_meshes` keeps the real meshes, a stronger baseline; otherwise objects are boxes. Floor and
+    ceiling are those of the real room that determines the number of objects.
     """
     pool = [item for scene in real for item in scene.objects]
     if not pool:

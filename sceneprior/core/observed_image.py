@@ -21,7 +21,7 @@ class ObservedImage:
     """Camera and instance masks of one image with n visible objects; arrays as in `RoomViews`."""
 
     name: str
-    """Stem of the names of files about this image."""
+    """Stem of the names of output files for this image."""
     label_set: str
     object_class: Int64[np.ndarray, " n"]
     instance_ids: Integer[np.ndarray, "height width"]

@@ -70,7 +70,7 @@ class SceneMatch:
     """True if the classes agree."""
     decoded_count: int
     truth_count: int
-    """Numbers of objects in the two scenes, matched or not."""
+    """Number of true objects; like `decoded_count`, it includes unmatched objects."""
 
     @property
     def class_accuracy(self) -> float | None:

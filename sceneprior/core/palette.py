@@ -1,4 +1,4 @@
-"""Quiet colours of classes for pictures that people look at: beds blue, wood brown, seats green.
+"""Muted class colours for pictures that people look at: beds blue, wood brown, seats green.
 
 Metrics and pictures of masks use `classes.class_colors`, which differ as clearly as possible.
 """
@@ -34,7 +34,7 @@ _COLORS = {
 def quiet_colors(names: Sequence[str]) -> UInt8[np.ndarray, "classes 3"]:
     """One RGB colour for each class name, the same in every label set.
 
-    A name without a colour of its own gets a muted one that depends only on the name.
+    A class without an entry in the table gets a muted colour that depends only on its name.
     """
     return np.array([_color(name) for name in names], dtype=np.uint8).reshape(-1, 3)
 

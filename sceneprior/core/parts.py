@@ -84,8 +84,8 @@ def inside(
 def center_and_radii(
     kind: int, ends: Float[np.ndarray, "3 2"]
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Centre and radii of the ellipsoid that a part is, or is half of; for a cylinder, those along
-    x and z are the ellipse's."""
+    """Centre and radii of the full ellipsoid of a part that is an ellipsoid or half of one; for a
+    cylinder, the radii along x and z are those of its base."""
     center, radii = ends.mean(axis=1), (ends[:, 1] - ends[:, 0]) / 2
     if kind in (DOME, BOWL):
         center[1], radii[1] = ends[1, 0 if kind == DOME else 1], 2 * radii[1]
@@ -93,8 +93,8 @@ def center_and_radii(
 
 
 def filled_cells(parts: Parts, cells: int, margin: float) -> Bool[np.ndarray, "x y z"]:
-    """True for the cells, of a grid that spans `margin` boxes, whose centres lie in a part and
-    within the outline."""
+    """True for grid cells whose centres lie in a part and within the outline; the grid is `margin`
+    times as large as the box."""
     middles = ((np.arange(cells) + 0.5) / cells - 0.5) * margin
     points = np.stack(np.meshgrid(middles, middles, middles, indexing="ij"), axis=-1)
     found = np.zeros(points.shape[:3], bool)

@@ -78,11 +78,10 @@ class Turned(NamedTuple):
 
 
 class Solid(NamedTuple):
-    """A convex solid in the room frame that fills its axis-aligned box as far as its kind can."""
+    """A convex solid in the room frame, inscribed in its axis-aligned box."""
 
     kind: Literal["box", "cylinder", "ellipsoid", "dome", "bowl"]
-    """A kind of `core/parts.py`: cylinders stand upright; domes and bowls are halves of ellipsoids.
-    """
+    """A kind of `core/parts.py`: cylinders are upright; domes and bowls are half ellipsoids."""
     low_m: tuple[float, float, float]
     high_m: tuple[float, float, float]
 
@@ -143,7 +142,7 @@ class SceneObject:
 
 
 def quarter_turned(size_m: Sequence[float], quarters: int) -> Turned:
-    """The axis-aligned box of extents `size_m` as a box that is turned by quarters.
+    """Describe the axis-aligned box of extents `size_m` as a box rotated by quarter turns.
 
     >>> quarter_turned((2.0, 0.5, 1.0), 3)
     Turned(yaw_rad=-1.5707963267948966, size_m=(1.0, 0.5, 2.0), confidence=1.0)
@@ -216,7 +215,7 @@ class Scene:
         return np.array([item.size_m for item in self.objects], dtype=np.float64).reshape(-1, 3)
 
     def without_meshes(self) -> "Scene":
-        """Copy of the scene with boxes alone, for methods without meshes."""
+        """Copy of the scene in which objects are only boxes, for methods without meshes."""
         bare = (replace(item, mesh=None, solids=(), textured=()) for item in self.objects)
         return replace(self, objects=tuple(bare))
 
@@ -245,7 +244,7 @@ class Scene:
         return perspective(self)
 
     def show(self) -> None:
-        """Display the scene from any line of a notebook's cell; elsewhere an `InputError`."""
+        """Display the scene in a notebook, from any line of a cell; elsewhere an `InputError`."""
         notebook = sys.modules.get("IPython")
         if notebook is None or notebook.get_ipython() is None:
             raise InputError(

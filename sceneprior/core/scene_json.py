@@ -17,7 +17,7 @@ from sceneprior.core.scene import Opening, Scene, SceneObject, Solid, Turned, bo
 FORMAT = "sceneprior-scene"
 VERSION = 1
 LARGEST_M = 20.0
-"""Maximum length of a piece of furniture; the longest wardrobes and shelves have half of it."""
+"""Maximum length of a piece of furniture; the longest wardrobes and shelves are half as long."""
 FARTHEST_M = 100.0
 """Maximum absolute coordinate of a box centre or a corner of the floor."""
 MOST_OBJECTS = 1000
@@ -244,7 +244,7 @@ def check_openings(
 
 
 def unit_guess(numbers: Any) -> str:
-    """A question about the unit of lengths that are too large for metres."""
+    """Question about the unit, for messages about lengths that are too large for metres."""
     unit = "millimetres" if np.abs(numbers).max() > 1000 else "centimetres"
     return f"Are these {unit}? Give metres."
 

@@ -138,7 +138,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def shortened(said: object) -> str:
-    """Put a text on one line; of a long text, keep the beginning and the end."""
+    """Put a text on one line; cut out the middle of a long text."""
     text = " ".join(str(said).split())
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST // 2]} ... {text[-100:]}"
 
@@ -215,7 +215,7 @@ def _section_of(
     """
     section, keys, inner = model, list[str](), list[type[BaseModel]]()
     for part in location:
-        if len(inner) > 1:  # the variants of a section; the next part names one
+        if len(inner) > 1:  # several variants of a section; the next part names one
             section = next(v for v in inner if _tag(v) == part)
             inner = []
             continue

@@ -21,7 +21,7 @@ VIEW_ARRAYS: dict[str, tuple[str, tuple[_Side, ...]]] = {
 }
 """Type and shape of each array of a room; T views, n objects, images of H x W pixels."""
 IMAGES: dict[str, tuple[_Side, ...]] = {"instance_ids": ("T", "H", "W"), "stuff": ("T", "h", "w")}
-"""Shape of each array of images; `stuff` is optional, and h x w its own size."""
+"""Shape of each array of images; `stuff` is optional, and has its own size, h x w."""
 TRUTH_ARRAYS: dict[str, tuple[str, tuple[_Side, ...]]] = {
     "object_class": ("int16", ("m",)),
     "centers_m": ("float32", ("m", 3)),
@@ -71,7 +71,7 @@ def read_arrays(
 
 
 def read_turn(group: "h5py.Group") -> dict[str, Any]:
-    """Read the attributes of a room that preparing turned; empty for other rooms."""
+    """Read the attributes of a room that was rotated by data preparation; empty for other rooms."""
     if "turned_deg" not in group.attrs:
         return {}
     degrees, matrix = float(group.attrs["turned_deg"]), group.attrs["room_from_world"]
@@ -89,7 +89,7 @@ def checked_images(group: "h5py.Group", name: str = "instance_ids") -> "h5py.Dat
 
 
 def _check_size(name: str, stored: "h5py.Dataset") -> None:
-    """Reject an array whose shape needs more bytes than the file can hold for it.
+    """Reject an array whose shape needs more bytes than the file can store for it.
 
     A damaged shape may be huge.
     """

@@ -55,7 +55,7 @@ class Sightings:
     visible: np.ndarray
     """(T, n) bool."""
     mask_pixels: np.ndarray
-    """(T, n) int32, pixels of the visible mask."""
+    """(T, n) int32, number of pixels of each object's visible mask."""
     sides_clear: np.ndarray
     """(T, n, 4) bool: True if no other object touches the mask at this side of its box, so that the
     object ends there and is not occluded."""
@@ -77,12 +77,13 @@ class RoomViews(Sightings):
     """(H, W)."""
     stuff: np.ndarray | None = None
     """(T, h, w) uint8, index into `STUFF`: floor, walls, doors, windows and ceiling, thinned by
-    `stuff_step`; 0 where an object or anything else is, or nothing is known. None if the source
-    does not name them, or if the images were not read."""
+    `stuff_step`; 0 for objects, other surfaces and unknown pixels. None if the source does not name
+    them, or if the images were not read."""
     turned_deg: float = 0.0
-    """Angle about +y by which preparing turned the room, so that its walls run along x and z."""
+    """Angle about +y by which data preparation rotated the room, so that its walls run along x and
+    z."""
     room_from_world: np.ndarray | None = None
-    """(4, 4) float64 rigid transform from the source's world, in metres; only of turned rooms."""
+    """(4, 4) float64 rigid transform from the source's world, in metres; None for other rooms."""
 
 
 @dataclass(frozen=True)
@@ -279,7 +280,7 @@ def thinned_intrinsics(intrinsics: np.ndarray, step: int) -> np.ndarray:
 
 
 def stuff_step(image_size: tuple[int, int]) -> int:
-    """Step of `thinned` at which stuff is kept: the longer side is then about `STUFF_SIDE_PX`."""
+    """Step of `thinned` for images of stuff; their longer side is then about `STUFF_SIDE_PX`."""
     return max(1, round(max(image_size) / STUFF_SIDE_PX))
 
 

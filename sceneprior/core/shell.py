@@ -30,7 +30,7 @@ FLAT_RAD = 1e-3
 
 
 class Wall(NamedTuple):
-    """A wall on one side of the floor, in the direction of the outline."""
+    """A wall along one side of the floor's outline, from the side's start to its end."""
 
     start_m: Float[np.ndarray, "2"]
     end_m: Float[np.ndarray, "2"]
@@ -145,8 +145,8 @@ def panels(wall: Wall, height_m: float) -> list[Panel]:
 
 
 def ceiling_height(scene: Scene) -> float:
-    """Height of a scene's ceiling: if it is not known, that of the top of the highest lamp, or else
-    2.6 m, and no less than furniture needs."""
+    """Height of a scene's ceiling. An unknown ceiling is at the top of the highest lamp, or else at
+    2.6 m, or higher if furniture needs it."""
     if scene.ceiling_m is not None:
         return scene.ceiling_m
     tops = scene.centers_m[:, 1] + scene.sizes_m[:, 1] / 2
@@ -189,8 +189,8 @@ def _walls(corners: Float[np.ndarray, "corners 2"]) -> list[Wall]:
 def _grown(
     corners: Float[np.ndarray, "corners 2"], scene: Scene
 ) -> tuple[Float[np.ndarray, "corners 2"], float]:
-    """The outline after its sides are moved outwards until it contains all furniture, and the
-    largest distance of a side from its old place."""
+    """Move the sides of the outline outwards until it contains all furniture; also return the
+    largest distance that a side moved."""
     walls = _walls(corners)
     offsets = np.zeros(len(corners))
     here = corners

@@ -1,7 +1,7 @@
 """Rooms made ready for physics: objects stand on the floor or on other objects, and do not overlap.
 
-Generated rooms come close to this, but furniture may float by a centimetre, and a lifted chair may
-lack a leg or reach into a table. The changes are counted.
+Generated rooms nearly meet these conditions, but furniture may float by a centimetre, and a lifted
+chair may lack a leg or reach into a table. The changes are counted.
 """
 
 import itertools
@@ -22,10 +22,10 @@ GAP_M = 2e-3
 TOUCHING_M = 5e-4
 """Largest overlap of two bodies that is tolerated."""
 FLOOR_M = 0.3
-"""Largest height of the lower face of an object that is set on the floor."""
+"""Maximum height of the lower face of objects that are always set on the floor."""
 RESTS_M = 0.15
-"""Largest distance between the lower face of a higher object and the top of another object on which
-it is set. Without such an object, it is set on the floor, too."""
+"""Maximum vertical distance by which an object above `FLOOR_M` is moved onto another object. If no
+object is within this distance, it is set on the floor, too."""
 SLABS = 8
 """Number of slabs into which a body that is a mesh is cut."""
 STEP_M, REACH_M = 0.05, 2.0
@@ -81,7 +81,7 @@ def _slabs(points: Float[np.ndarray, "points 3"]) -> list[Float[np.ndarray, "2 3
 
 
 def _set_down(objects: tuple[SceneObject, ...], changes: Counter[str]) -> list[SceneObject]:
-    """The objects after each is set on the floor, or on the object below it; lowest first."""
+    """Set each object on the floor or on the object below it, the lowest first."""
     placed = list(objects)
     bounds = [body_boxes(item) for item in objects]
     bottoms = np.array([each[:, 0, 1].min() for each in bounds])
@@ -119,7 +119,7 @@ def _on_feet(item: SceneObject, changes: Counter[str]) -> SceneObject:
 
 
 def _apart(scene: Scene, objects: list[SceneObject], changes: Counter[str]) -> list[SceneObject]:
-    """The objects moved apart, the largest first; those without a free place are left out."""
+    """Move objects apart, the largest first; objects without a free place are left out."""
     floor = _free_floor(scene)
     kept: dict[int, SceneObject] = {}
     taken = np.zeros((0, 2, 3))

@@ -100,8 +100,7 @@ class DecodedScenes:
     """Look of each object, that is, its prototype and pose as one index: prototype * 8 + pose
     (`lifted/prototypes.py`). None before the shape decoder has run, and if it predicts meshes."""
     next_looks: Int[Tensor, "rooms objects"] | None = None
-    """Look into which the shape of each object changes along a path; None for rooms by themselves.
-    """
+    """Look into which each object changes along a path; None if the room is not on a path."""
     shares: Float[Tensor, "rooms objects"] | None = None
     """Share of `next_looks` in each object's shape, at least 0 and less than 1."""
 
@@ -153,7 +152,7 @@ class RoomBoxes(Batch):
     """Rectangle in which each room was furnished: centre x, z and extents x, z; None if unknown."""
     walls_m: Float[Tensor, "rooms 4"] | None = None
     """Distances of the walls near the furniture from the origin, outwards, at low z, low x, high z
-    and high x; NaN where no wall is known. None if no wall is."""
+    and high x; NaN where no wall is known. None if no walls are known."""
 
     def split(self, rooms: int) -> list["RoomBoxes"]:
         """Split into batches of at most `rooms` rooms, without ids."""

@@ -1,4 +1,4 @@
-"""Finds the bases of walls and doors where masks of floor meet masks of walls, without depth.
+"""Finds the bases of walls and doors, where floor meets wall in images of stuff, without depth.
 
 The floor is the plane y = 0, so a pixel on the lower edge of a wall is one point of the room.
 """
@@ -13,31 +13,32 @@ from sceneprior.core.classes import STUFF
 from sceneprior.core.shards import RoomViews, stuff_step, thinned_intrinsics
 
 COARSE_M = 0.15
-"""Length on the floor of a pixel, along its ray, above which the pixel is not used."""
+"""Maximum length on the floor that a pixel covers along its ray; coarser pixels are not used."""
 NEAR_M = 0.1
-"""Largest distance of a point from its wall."""
+"""Maximum distance of a point from its wall."""
 FACED = 0.4
-"""Sine of the angle with the wall at which some ray must meet each of its parts. Where a wall hides
-the floor beyond its corner, the border of the two runs along a ray, and is no wall."""
+"""Sine of the angle between ray and wall that some ray must exceed in each visible part of a wall.
+Where a wall occludes the floor behind its corner, the border between them runs along a ray, and is
+not the base of a wall."""
 SHORTEST_M = 0.3
 """Length of the shortest visible part of a wall."""
 GAP_M = 0.3
-"""Longest hidden stretch within a part."""
+"""Length of the longest hidden stretch within a part."""
 LEAST_VIEWS = 2
-"""A wall is found if at least so many views show it."""
+"""Minimum number of views that must show a wall."""
 NARROWEST_M = 0.5
 """Width of the narrowest door."""
 _DIRECTIONS, _OFFSET_M = 180, 0.04
-"""Directions of normals, and widths of offsets, among which walls are searched."""
+"""Number of directions of normals, and bin width of offsets, in the search for walls."""
 _MOST_LINES, _MOST_POINTS, _LEAST_POINTS = 24, 6000, 12
 _BIN_M = 0.05
 _ERROR_PX = 2.0
-"""Pixels by which a point may be off and still be one of a line that was found."""
+"""Additional distance in pixels, along its ray, at which a point still belongs to a found line."""
 _PIXEL_ERROR_M = 0.01
 
 FLOOR, DOOR = STUFF.index("floor"), STUFF.index("door")
 BARRIER = np.isin(STUFF, ("wall", "door", "window"))
-"""True for the values of stuff that stand on the floor and hide what is behind them."""
+"""True for values of stuff that stand on the floor and hide the space behind them."""
 
 
 class Wall(NamedTuple):
@@ -48,7 +49,7 @@ class Wall(NamedTuple):
     inward: Float[np.ndarray, "2"]
     """Unit normal, into the room."""
     error_m: float
-    """Standard error of the wall's offset along its normal, by the differences between views."""
+    """Standard error of the wall's offset along its normal, from the differences between views."""
 
 
 class Door(NamedTuple):
@@ -80,8 +81,8 @@ class _Line(NamedTuple):
     offset_m: float
 
     def has(self, edges: _Edges, pixels: float = 0.0) -> Bool[np.ndarray, " points"]:
-        """True for points that face the line, within `NEAR_M` and so many pixels along their
-        ray."""
+        """True for points that face the line, and whose distance from it is at most `NEAR_M` plus
+        the size of `pixels` pixels."""
         facing = edges.towards_camera @ self.normal
         within_m = NEAR_M + pixels * edges.weight**-0.5 * facing
         near = np.abs(edges.points_m @ self.normal - self.offset_m) < within_m
@@ -91,7 +92,7 @@ class _Line(NamedTuple):
 def find_walls(
     room: RoomViews, views: Sequence[int] | np.ndarray | None = None
 ) -> tuple[tuple[Wall, ...], tuple[Door, ...]]:
-    """Find the bases of walls and doors that some `views`, or all, of a room with `stuff` show.
+    """Find the bases of walls and doors that `views` (None: all) of a room with `stuff` show.
 
     Lines are found one after another, each where most points lie (a Hough transform), and fitted to
     the points near them. Walls may have any direction.

@@ -1,1 +1,1 @@
-"""Furniture made of tables of parts: solids, the tables of each class, and models of all sizes."""
+"""Procedural furniture: solids, tables of parts for each class, and models of all sizes."""

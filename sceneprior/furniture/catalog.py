@@ -31,7 +31,7 @@ Percentiles = tuple[tuple[float, ...], ...]
 """The 10th, 50th and 90th percentiles of width, of height and of depth, in metres."""
 
 # Half of 3D-FUTURE's 41 dressing chairs are wider than 2.29 m, so they are presumably sets of
-# table, mirror and seat (not checked). We want the seat alone, which lies near their 10th
+# table, mirror and seat (not checked). We want only the seat, whose size is near their 10th
 # percentile.
 SIZES_OF_OURS: dict[str, Percentiles] = {
     "dressing_chair": ((0.50, 0.53, 0.62), (0.53, 0.68, 0.85), (0.50, 0.575, 0.64))
@@ -101,12 +101,12 @@ Catalog = dict[str, list[Model]]
 
 @lru_cache(maxsize=4)  # meshes are built once per process
 def make_catalog(seed: int, label_set_name: str) -> Catalog:
-    """Make `VARIANTS` models of every class but void; a class has the same in all label sets."""
+    """Make `VARIANTS` models of every class but void, the same in all label sets."""
     return {name: make_variants(seed, name) for name in label_set(label_set_name)[1:]}
 
 
 def furniture_classes() -> frozenset[str]:
-    """Classes of which `make_variants` makes models."""
+    """Classes for which `make_variants` makes models."""
     return frozenset(_CATEGORIES) | {"sofa", "table"}
 
 

@@ -14,7 +14,7 @@ Parts = list[trimesh.Trimesh]
 """A piece of furniture: closed solids, which may intersect."""
 
 Number = float | int | np.number
-"""A length in metres, or an angle, as the expressions of the tables have it."""
+"""A length in metres, or an angle, as written in the expressions of the tables."""
 
 Numbers = Number | np.ndarray | Sequence[Any]
 """A number, or an array of them in any form."""

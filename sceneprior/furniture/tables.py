@@ -36,10 +36,10 @@ import yaml
 from sceneprior.furniture.solids import PARTS, Number, Parts, Vector, box
 
 DEEP_SOFA_M = 1.3
-"""Depth from which on a sofa has a chaise; sofas with a single row of seats are less deep."""
+"""Minimum depth of a sofa with a chaise; sofas with a single row of seats are less deep."""
 
 DINING_WIDTH_M = 1.0
-"""Width from which on a table is a dining table; narrower ones are side tables."""
+"""Minimum width of a dining table; narrower tables are side tables."""
 
 
 def _around(count: int, x: Number, z: Number) -> list[tuple[Number, Number]]:

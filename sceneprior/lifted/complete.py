@@ -3,7 +3,7 @@
 A run's sampler draws the missing objects, given the others. Without a sampler, latents are fitted:
 
 1. Latents are sampled from the run's distribution and decoded. Those whose rooms are most similar
-   to the given objects become starting points; each answer has `RESTARTS` of its own.
+   to the given objects become starting points, `RESTARTS` for each answer.
 2. The network is frozen, and each latent is optimised until its room holds the given classes and
    boxes, with a penalty on its distance from the start. Predictions are matched to the given
    objects anew in each step, as in training, but in 3D.
@@ -91,7 +91,7 @@ def complete(
         )
     starts = _starts(trained, given, count * RESTARTS, seed, distribution)
     z, loss = fit_latents_to_objects(trained, starts, repeated(given, count * RESTARTS), steps)
-    # Starts are sorted, best first, and dealt out in turn, so that every answer gets good ones.
+    # Starts are sorted, best first, and distributed in turn, so that every answer gets good ones.
     best = loss.view(len(scenes), RESTARTS, count).argmin(dim=1, keepdim=True)
     z = z.view(len(scenes), RESTARTS, count, -1).take_along_dim(best.unsqueeze(-1), dim=1)[:, 0]
     return [
@@ -108,7 +108,8 @@ def _drawn(
     seed: int,
     classes: Sequence[str] | None,
 ) -> list[list[Scene]]:
-    """Answers drawn by a run's sampler, by room."""
+    """Complete each scene with the sampler, once for each of `names`: sample a room given the
+    scene's objects, and insert these objects into it."""
     count = len(names)
     coming = None if classes is None else class_rows(trained, classes)
     most = trained.config.model.max_objects

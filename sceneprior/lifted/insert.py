@@ -10,8 +10,9 @@ from sceneprior.core.overlaps import match_scenes, shared_of_smaller
 from sceneprior.core.scene import Scene, SceneObject
 
 BADLY = 0.25
-"""Overlap, as a share of the smaller of two volumes, above which a room's own object is removed for
-a given one: a chair pushed under a table may stay, a wardrobe in a bed may not."""
+"""Overlap, as a share of the smaller of two volumes, above which an object of the room is
+removed in favour of a given one: a chair pushed under a table may stay, a wardrobe in a bed may
+not."""
 
 
 def insert(

@@ -1,4 +1,4 @@
-"""Looks along a path of rooms: where each is shown, and its parts in an object's box."""
+"""Looks along a path between rooms: where on the path each look is shown, and its parts."""
 
 from typing import NamedTuple
 
@@ -11,12 +11,12 @@ from sceneprior.core.parts import SQUARE, Parts
 from sceneprior.lifted.prototypes import turn_of
 
 HOLD = 0.125
-"""Share of the path for which a look between two others must hold to be shown. A smaller share
-follows the decoder more closely, and objects change faster."""
+"""Minimum share of the path that a look between two others must hold to be shown. A smaller value
+follows the decoder more closely, but objects change faster."""
 
 
 class Shown(NamedTuple):
-    """Looks that a prediction shows during one of its appearances, and where on the path."""
+    """Looks shown during one appearance of a prediction on a path, and the place of each."""
 
     places: Float[np.ndarray, " shown"]
     looks: Int[np.ndarray, " shown"]
@@ -26,7 +26,7 @@ class Shown(NamedTuple):
         return float(np.abs(place - np.clip(place, *self.places[[0, -1]])))
 
     def at(self, place: float) -> tuple[int, int, float]:
-        """The two looks between which the shape is, and the share of the second, below 1."""
+        """The two looks between which the shape lies, and the weight of the second, in [0, 1)."""
         after = int(np.searchsorted(self.places, place, side="right"))
         look, next_look = self.looks[max(after - 1, 0)], self.looks[min(after, len(self.looks) - 1)]
         if after in (0, len(self.looks)) or look == next_look:
@@ -61,7 +61,7 @@ def shown_looks(looks: Int[np.ndarray, " steps"], kept: Bool[np.ndarray, " steps
 
 
 def posed_parts(parts: Parts, pose: int) -> Parts:
-    """The parts of a prototype in a pose, with its mirror images as parts of their own."""
+    """The parts of a prototype in a pose, with mirror images as separate parts."""
     quarters, mirrored = turn_of(pose)
     across = quarter_rotation(quarters) * ([-1, 1, 1] if mirrored else [1, 1, 1])
     kind, ends = zip(*parts.solids(), strict=True)
@@ -77,8 +77,8 @@ def posed_parts(parts: Parts, pose: int) -> Parts:
 def stretched_parts(
     parts: Parts, own: Parts, size_m: Float[np.ndarray, "3"], new_size_m: Float[np.ndarray, "3"]
 ) -> Parts:
-    """Parts in the frame of an object of extents `size_m`, which consists of `own`, after its box
-    gets other extents (`stretched`)."""
+    """Stretch parts as an object that consists of `own` is stretched from the extents `size_m` to
+    `new_size_m` (`stretched`). Parts are in the frame of the object's box."""
 
     def moved(points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 3"]:
         return stretched(points, own, size_m, new_size_m)

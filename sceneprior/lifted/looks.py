@@ -1,4 +1,4 @@
-"""The look decoder: from an object's feature to a prototype, made of parts, in one of its poses.
+"""The look decoder: maps an object's feature to a prototype, made of parts, in one of its poses.
 
 It replaces the paper's deformed template; such shapes may have legs, holes and thin tops.
 """
@@ -51,7 +51,7 @@ class LookConfig(ShapeModuleConfig):
     """Extent of these grids, relative to the object's box."""
 
     def build(self, features: int) -> "LookDecoder":
-        """The module for object features of this width, freshly initialised."""
+        """The module for object features of width `features`, freshly initialised."""
         return LookDecoder(features, self)
 
 
@@ -60,8 +60,8 @@ class LookDecoder(ShapeModule):
 
     Looks are defined in `lifted/prototypes.py`: a prototype shape in one of its poses. Squared
     distances between the codes of looks approximate the number of cells in which their grids
-    differ. So the code is trained with a squared error, near misses cost little, and the decoded
-    shape is still a sharp one rather than the mean of several.
+    differ. The code is trained with a squared error, so a similar look costs little, and the
+    decoded shape is always a sharp prototype rather than a mean of several.
 
     Prototypes and the codes of their looks are buffers, not parameters: they are computed from the
     training data before the first step (`learn_prototypes`) and saved in checkpoints.
@@ -137,7 +137,7 @@ class LookDecoder(ShapeModule):
         return Prototypes(parts, grids, sizes_m.astype(np.float64), labels, common)
 
     def parts(self, prototype: int) -> Parts:
-        """The parts of a prototype; the box for one that is not in use."""
+        """The parts of a prototype; a single box for an unused prototype."""
         used = self.part_kind[prototype] != self.unknown
         if not used.any():
             return whole_box()
@@ -224,8 +224,7 @@ class LookDecoder(ShapeModule):
         return blend_parts(here, there, share)
 
     def looks(self, codes: Float[Tensor, "*objects codes"]) -> Int[Tensor, "*objects"]:
-        """The look whose code is nearest, the first of equal ones; 0 if there are no prototypes
-        yet."""
+        """The look whose code is nearest, in a tie the first; 0 before prototypes are set."""
         known = (self.object_class != self.unknown).repeat_interleave(POSES).nonzero()[:, 0]
         if not len(known):
             return torch.zeros(codes.shape[:-1], dtype=torch.int64, device=codes.device)
@@ -262,7 +261,7 @@ class LookDecoder(ShapeModule):
     def _in_box(
         self, points: Float[np.ndarray, "points 3"], look: int, box_m: Float[np.ndarray, "6"]
     ) -> Float[np.ndarray, "points 3"]:
-        """Points in the frame of a prototype, in the room: stretched, mirrored, turned, scaled."""
+        """Map points from a prototype's frame to the room: stretch, mirror, turn, scale."""
         prototype, pose = divmod(look, POSES)
         size_m = self.sizes_m[prototype].double().cpu().numpy()
         own_m = turned_extents(box_m[None, 3:], pose)[0]
@@ -292,7 +291,7 @@ def _box_m(decoded: DecodedScenes, room: int, item: int) -> Float[np.ndarray, "6
 def _solids_in(parts: Parts, box_m: Float[np.ndarray, "6"]) -> tuple[Solid, ...]:
     """Parts without mirror images, in the frame of a box (centre, full extents), as solids."""
     placed_m = parts.ends.swapaxes(1, 2) * box_m[3:] + box_m[:3]
-    # A part in the middle is its own mirror image, to rounding.
+    # A part in the middle is its own mirror image, up to rounding.
     _, first = np.unique(placed_m.round(5), axis=0, return_index=True)
     low_m, high_m = placed_m.swapaxes(0, 1).tolist()
     return tuple(

@@ -31,7 +31,7 @@ def match_lifted(scenes: DecodedScenes, rooms: LiftedRooms, box_weight: float = 
         sigma = argmin sum_k -p_k(l_j) + lambda_B |b_k - b_j|_1
 
     as Eq. S2, but b is a 3D box (centre and extents), with weight `PER_METRE` per metre. An object
-    without a lifted box has zero cost, whatever prediction it is matched to.
+    without a lifted box has zero cost with every prediction.
     """
     distance = torch.cdist(predicted_boxes(scenes), rooms.boxes_m, p=1)
     cost = class_cost(scenes, rooms.object_class) + box_weight * PER_METRE * distance

@@ -70,7 +70,7 @@ def choose_prototypes(
     usable: Bool[np.ndarray, " objects"],
     most: int,
 ) -> tuple[Int[np.ndarray, " prototypes"], Bool[np.ndarray, " prototypes"]]:
-    """Choose the objects that become prototypes, and tell which of them are common (`COMMON`).
+    """Choose the objects that become prototypes, and mark the common ones (`COMMON`).
 
     For each class, the object that looks like most of the remaining objects is chosen, again and
     again, until every usable object looks like a prototype. The threshold is `ALIKE`, raised by
@@ -92,8 +92,8 @@ def choose_prototypes(
 def _covering(
     apart: list[tuple[np.ndarray, np.ndarray]], alike: float
 ) -> tuple[Int[np.ndarray, " prototypes"], Bool[np.ndarray, " prototypes"]]:
-    """Rows of the prototypes that `choose_prototypes` finds at the threshold `alike`, and whether
-    they are common; `apart` holds each class's rows and their distances."""
+    """Rows of the prototypes that `choose_prototypes` finds at the threshold `alike`, and which of
+    them are common; `apart` holds each class's rows and their distances."""
     items, common = [], []
     for rows, distance in apart:
         near = (distance <= alike) | np.eye(len(rows), dtype=bool)
@@ -138,9 +138,9 @@ def pose_distances(
     objects: tuple[Bool[np.ndarray, "objects x y z"], Float[np.ndarray, "objects 3"]],
     offered: tuple[Bool[np.ndarray, "offered x y z"], Float[np.ndarray, "offered 3"]],
 ) -> Float[np.ndarray, "objects offered poses"]:
-    """Distance (see `ALIKE`) of each object from each offered object, in each pose of the latter.
+    """Distance (see `ALIKE`) of each object from each `offered` object in each of its poses.
 
-    Both are given by their grids and their extents in metres.
+    Objects are given by their grids and their extents in metres.
     """
     (coarse, log_sizes), (offered_coarse, offered_sizes) = (
         (pooled(grids, COARSE), np.log(sizes_m)) for grids, sizes_m in (objects, offered)

@@ -45,16 +45,16 @@ def drawn_by_sampler(trained: TrainedPrior, distribution: str | None) -> Trained
 def sample_scenes(
     trained: TrainedLifted, names: Sequence[str], seed: int, given: Given | None = None
 ) -> list[Scene]:
-    """A new room with meshes for each name; see `draw_rooms`."""
+    """Sample a room with meshes for each name; see `draw_rooms`."""
     assert trained.sampler is not None, "callers ask trained.sampler first"
     rooms = draw_rooms(trained.sampler, len(names), seed, given)
     return [scene_of(trained, name, rooms, row) for row, name in enumerate(names)]
 
 
 def scene_of(trained: TrainedLifted, name: str, rooms: RoomBoxes, row: int) -> Scene:
-    """A drawn room as a scene with meshes; its floor is the rectangle of the room, if known.
+    """Convert a sampled room to a scene with meshes; its floor is the room's rectangle, if known.
 
-    The yaws of objects are those of their looks' fronts (`lifted/sampler/fronts.py`).
+    Yaws of objects are those of the fronts of their looks (`lifted/sampler/fronts.py`).
     """
     sampler, shapes = trained.sampler, trained.prior.shape
     assert sampler is not None, "callers ask trained.sampler first"
@@ -70,7 +70,7 @@ def scene_of(trained: TrainedLifted, name: str, rooms: RoomBoxes, row: int) -> S
         # A given object whose class has no prototype gets no mesh.
         known = int(sampler.look_class[look]) == index
         if box[1] - box[4] / 2 < HANGS_M:
-            box[1] = box[4] / 2  # lifted boxes end a little above the floor that they stand on
+            box[1] = box[4] / 2  # lifted boxes end a little above the floor
         filled = _down_to_floor(shapes, look, box) if known else box
         mesh = shapes.mesh(look, filled) if known else None
         solids = shapes.solids(look, filled) if known else ()
@@ -91,19 +91,19 @@ def scene_of(trained: TrainedLifted, name: str, rooms: RoomBoxes, row: int) -> S
 def _down_to_floor(
     shapes: LookDecoder, look: int, box_m: Float[np.ndarray, "6"]
 ) -> Float[np.ndarray, "6"]:
-    """The box to stretch a look into, such that its lowest part is at the bottom of `box_m` if that
-    is the floor; masks show too little of the lowest parts of some prototypes."""
+    """Extend a box that stands on the floor downwards, so that the lowest part of its look reaches
+    the floor; masks show too little of the lowest parts of some prototypes."""
     bottom, top = box_m[1] - box_m[4] / 2, box_m[1] + box_m[4] / 2
     lowest = min(solid.low_m[1] for solid in shapes.solids(look, box_m))
     if bottom > 0 or lowest <= 0 or lowest >= top / 2:
         return box_m
-    # Parts keep their order from bottom to top, so the share of empty height is lowest / top.
+    # Parts keep their relative heights, so the empty share of the height is lowest / top.
     height = top / (1 - lowest / top)
     return np.array([box_m[0], top - height / 2, box_m[2], box_m[3], height, box_m[5]])
 
 
 def class_rows(trained: TrainedLifted, labels: Sequence[str]) -> Int[Tensor, "1 labels"]:
-    """Indices of named classes, in the form of `Given.coming`.
+    """Indices of named classes, as in `Given.coming`.
 
     Raises:
         InputError: a class is not in the training rooms.

@@ -19,7 +19,7 @@ from sceneprior.training.steps import batch_seed, full_precision
 
 
 class LiftedStage(LatentStage):
-    """The layout loss against lifted 3D boxes, and the distance to the lifted shapes."""
+    """Trains with the layout loss against lifted 3D boxes, and the distance to lifted shapes."""
 
     stage: LiftedStageConfig
     loss: LiftedLossConfig
@@ -47,7 +47,7 @@ class LiftedStage(LatentStage):
             targets = self.looks.targets(rooms.looks.clamp(min=0))
             losses["shape"] = shape_code_loss(scenes, known, *targets)
             if self.loss.latents:
-                seed = batch_seed(self.seed, self.trainer, batch_idx) + 1  # not the noise's
+                seed = batch_seed(self.seed, self.trainer, batch_idx) + 1  # not the noise's seed
                 generator = torch.Generator().manual_seed(seed)
                 space = self.prior.latent_space
                 losses["latents"] = latent_loss(self.latents.weight, space.shift_free, generator)

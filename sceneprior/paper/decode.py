@@ -32,7 +32,7 @@ class DecodedRoom(NamedTuple):
 
 def kept_predictions(decoded: DecodedScenes, target: str) -> Bool[Tensor, "rooms objects"]:
     """True for predictions that are objects: the completeness scores keep them, and their most
-    likely class is not `void`, which stands for no piece of furniture."""
+    likely class is not `void`."""
     kept = kept_objects(decoded.completeness_logits, target)
     return kept & (decoded.class_logits.argmax(dim=-1) != VOID)
 

@@ -40,7 +40,7 @@ class FitSchedule:
 
 
 SCHEDULES = {"paper": FitSchedule()}
-"""Schedules by name; `paper` is the one of supplement D."""
+"""Schedules by name; `paper` is that of supplement D."""
 
 
 class ViewLoss(NamedTuple):

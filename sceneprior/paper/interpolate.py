@@ -25,7 +25,7 @@ from sceneprior.render.pictures import contact_sheet, gif_bytes, png_bytes
 from sceneprior.render.topdown import corner_view, perspective
 
 STEPS = 129
-"""Points of a path at which looks are decoded, to find where each one holds."""
+"""Number of points on a path at which looks are decoded, to find the range in which each holds."""
 TILE = (240, 320)
 """Height and width in pixels of a picture in the strip, and of the animation."""
 STRIP_COLUMNS = 9
@@ -33,17 +33,18 @@ STRIP_COLUMNS = 9
 BETWEEN = 4
 """Number of pictures that the animation shows per step."""
 FRAME_MS = 70
-"""Milliseconds for which the animation shows a picture."""
+"""Duration of a picture of the animation in milliseconds."""
 PAUSE_MS = 700
-"""Milliseconds for which the animation shows the first and the last picture before it reverses."""
+"""Pause of the animation at the first and the last picture, in milliseconds."""
 
 
 @dataclass(frozen=True)
 class RoomPath:
     """The geodesic between two latents (in a cube, the straight line) and the rooms on it.
 
-    A place on it is a number from 0 to 1. Rooms at 0 and 1 are those that the latents decode to;
-    between them, shapes change gradually (`ShapeModule.along_path`), however many rooms are drawn.
+    Places on the path are numbers from 0 to 1. At 0 and 1, the rooms are those that the two latents
+    decode to. In between, shapes change gradually (`ShapeModule.along_path`), whatever the number
+    of rooms drawn.
     """
 
     trained: TrainedPrior
@@ -88,11 +89,11 @@ def even_places(steps: int) -> Float[Tensor, " steps"]:
 
 
 def interpolate(trained: TrainedPrior, start: Point, end: Point, steps: int) -> list[Scene]:
-    """Rooms `step_00`, `step_01`, ... on the way from one latent to another.
+    """Rooms `step_00`, `step_01`, ... on the path from one latent to another.
 
-    A room's `extra` holds `along`, its position from 0 to 1, and `slots`, the index of each
-    object's prediction: objects with the same slot in two rooms are the same object, moved. `steps`
-    includes both ends; `start` and `end` are anything that `latent_of` accepts.
+    A room's `extra` holds `along`, its place from 0 to 1, and `slots`, the index of each object's
+    prediction. Objects with the same slot in two rooms are the same object. `steps` includes both
+    ends; `start` and `end` are anything that `latent_of` accepts.
     """
     path = RoomPath(trained, latent_of(trained, start), latent_of(trained, end))
     places = even_places(steps)

@@ -37,10 +37,10 @@ def dropout(x: Float[Tensor, "*shape"], p: float) -> Float[Tensor, "*shape"]:
 
 
 class ShapeModule(nn.Module, ABC):
-    """A shape decoder: from an object's feature to its shape, and from that to a mesh."""
+    """A shape decoder: maps an object's feature to its shape, and the shape to a mesh."""
 
     faces: Tensor | None
-    """(faces, 3) triangles, if all of its meshes share one topology; else None."""
+    """(faces, 3) triangles, if all meshes of the decoder share them; else None."""
 
     @abstractmethod
     def add_shapes(
@@ -61,8 +61,8 @@ class ShapeModule(nn.Module, ABC):
     ) -> DecodedScenes:
         """Rooms at places (0 to 1) of a path, with shapes that change gradually along it.
 
-        `path` has the rooms at equal steps from 0 to 1, and `kept` their predictions that are
-        objects. Meshes of a network change gradually by themselves.
+        `path` has the rooms at equal steps from 0 to 1, and `kept` selects the predictions that are
+        objects. Deformed meshes change gradually anyway, so by default `rooms` stays unchanged.
         """
         return rooms
 
@@ -80,7 +80,7 @@ class ShapeModuleConfig(Section, ABC):
 
     @abstractmethod
     def build(self, features: int) -> ShapeModule:
-        """The module for object features of this width, freshly initialised."""
+        """The module for object features of width `features`, freshly initialised."""
 
 
 class DecoderConfig(Section, ABC):
@@ -95,4 +95,4 @@ class DecoderConfig(Section, ABC):
 
     @abstractmethod
     def build(self, width: int, max_objects: int) -> nn.Module:
-        """The module, for features of D_z = `width`, freshly initialised."""
+        """The module for features of D_z = `width`, freshly initialised."""

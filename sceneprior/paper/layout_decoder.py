@@ -115,8 +115,8 @@ def above_floor(y: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """ReLU(y) whose gradient at y <= 0 is kept where a descent step would raise y, and 0 elsewhere.
 
     With a plain ReLU, an object that has reached the floor cannot leave it. Early in training, the
-    network cannot yet tell lamps from other furniture, most of which stands on the floor, so it
-    moves lamps down as well.
+    network cannot yet distinguish lamps from other furniture, most of which stands on the floor, so
+    it moves lamps down as well.
     """
     lifted: Tensor = _AboveFloor.apply(y)
     return lifted

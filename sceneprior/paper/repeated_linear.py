@@ -12,11 +12,11 @@ from torch.autograd.function import once_differentiable
 class RepeatedLinear:
     """The layers x @ weight[g] + bias[g], applied to several x one after the other.
 
-    Autograd alone forms the gradient of the weights once per use and adds it to the sum of the
-    previous ones. For layers of a million weights and a few rows per use, reading and writing
+    Autograd alone computes the gradient of the weights once per use and adds it to the sum of the
+    previous gradients. For layers of a million weights and a few rows per use, reading and writing
     these gradients takes as long as the products. Here each use passes on the gradient of its
-    output, and after the last one a single product of all rows gives the gradient of the weights.
-    The gradient is the same sum in another order. It cannot be differentiated again.
+    output, and after the last use a single product of all rows gives the gradient of the weights.
+    This is the same sum in another order. It cannot be differentiated again.
 
     Args:
         weight: One matrix per group.
@@ -44,7 +44,7 @@ class RepeatedLinear:
     def __call__(
         self, x: Float[Tensor, "groups rows inputs"]
     ) -> Float[Tensor, "groups rows outputs"]:
-        """The next use."""
+        """Apply the layer to the next x."""
         x = x.to(self.weight.dtype)
         if self._inputs is not None:
             self._inputs.append(x.detach())
@@ -52,7 +52,7 @@ class RepeatedLinear:
 
 
 class _Gather(torch.autograd.Function):
-    """The bias of each use. The gradient of a bias is that of the use's output, row by row."""
+    """The bias, once per use. Its backward pass gets the gradients of all outputs."""
 
     @staticmethod
     def forward(
@@ -64,6 +64,6 @@ class _Gather(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        gradient = torch.cat(upstream[: len(ctx.inputs)], dim=1)  # later uses never happened
+        gradient = torch.cat(upstream[: len(ctx.inputs)], dim=1)  # unused calls are left out
         weight = gradient.transpose(1, 2) @ torch.cat(ctx.inputs, dim=1)
         return weight.transpose(1, 2), gradient.sum(dim=1), None, None

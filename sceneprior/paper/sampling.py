@@ -98,7 +98,7 @@ def sample_logits(
     # centred^T centred is the covariance; the SVD gives its square root even where it is singular.
     _, scale, axes = torch.linalg.svd(centred / (len(logits) - 1) ** 0.5, full_matrices=False)
     drawn = (noise[:, : len(scale)] * scale) @ axes
-    # No room repeats before all have occurred.
+    # A room is repeated only after all rooms have been used.
     rooms = len(logits)
     rounds = [torch.randperm(rooms, generator=generator) for _ in range(-(-count // rooms))]
     start = centred[torch.cat(rounds)[:count]]
@@ -110,7 +110,7 @@ def sample_logits(
 def draw_latents(
     trained: TrainedPrior, count: int, seed: int, distribution: str | None = None
 ) -> tuple[Float[Tensor, "count dimension"], list[str]]:
-    """Latents sampled from a distribution (None: the run's own), and the names of their rooms.
+    """Sample latents from a distribution (None: the run's own); also return the rooms' names.
 
     The distribution `kernel` gives a warning that its rooms are near copies (`COPIES`).
     """
@@ -141,8 +141,8 @@ def write_latents(folder: Path, scenes: Sequence[Scene]) -> None:
 
 
 def latent_of(trained: TrainedPrior, point: Point) -> Float[Tensor, " dimension"]:
-    """The point of a run's latent space for a name (`read_latent`), for a scene (the latent it was
-    decoded from), or for a vector (the nearest point).
+    """The latent for a room's name (`read_latent`), for a scene (the latent from which it was
+    decoded), or for a vector (the nearest point of the latent space).
     """
     if isinstance(point, str):
         return read_latent(trained, point)
@@ -172,15 +172,13 @@ def _onto(trained: TrainedPrior, point: np.ndarray, source: str) -> Float[Tensor
 
 
 def read_latent(trained: TrainedPrior, text: str) -> Float[Tensor, " dimension"]:
-    """The point of a run's latent space that a text names.
-
-    The text is one of three:
+    """Read a latent of a run from text, which is one of:
 
     - the id of a training room;
     - `seed:7`, for the room that `synthesize -n 1 --seed 7` makes from latents; `paper:7` and
-      `kernel:7` name the distribution, too;
-    - a file of latents: `FILE` (its first latent), `FILE:3` (counted from 0) or `FILE:NAME`. A file
-      is a `latents.npz`, an .npy of (D,) or (n, D) numbers, or a .json of such lists.
+      `kernel:7` also name the distribution;
+    - a file of latents: `FILE` (its first latent), `FILE:3` (counted from 0) or `FILE:NAME`. The
+      file is a `latents.npz`, an .npy of (D,) or (n, D) numbers, or a .json of such lists.
     """
     file, _, item = text.rpartition(":")
     path, item = (Path(file), item) if file.endswith(_ENDINGS) else (Path(text), "0")
@@ -198,8 +196,8 @@ def read_latent(trained: TrainedPrior, text: str) -> Float[Tensor, " dimension"]
 
 
 def named_latent(trained: TrainedPrior, name: str, or_else: str) -> Float[Tensor, " dimension"]:
-    """The latent of a training room, named by its id, or of the room that `seed:7` names: that of
-    the run's distribution of latents, where `paper:7` and `kernel:7` name the distribution.
+    """The latent of a training room, given by its id, or of a new room: `seed:7` from the run's
+    distribution of latents, `paper:7` or `kernel:7` from the named distribution.
 
     The error for any other name lists what is valid; `or_else` is the last item of that list.
     """

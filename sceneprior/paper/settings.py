@@ -32,8 +32,7 @@ class LossConfig(Section):
 
 
 class LatentStageConfig(TrainConfig):
-    """Learning rates of a stage that trains the network together with one latent per training
-    room."""
+    """Settings of a stage that trains the network together with one latent per training room."""
 
     learning_rate: float = Field(1e-4, gt=0)
     """Learning rate of the network."""

@@ -119,7 +119,7 @@ class LatentStage(lightning.LightningModule, ABC):
 
 
 class LayoutStage(LatentStage):
-    """The layout loss L_L without shape decoding (section 3.4, Eq. 7)."""
+    """Trains with the layout loss L_L, without decoding shapes (section 3.4, Eq. 7)."""
 
     stage: LayoutConfig
     loss: LossConfig
@@ -138,7 +138,7 @@ class LayoutStage(LatentStage):
 
 
 class ShapeStage(LatentStage):
-    """The layout loss, now of deformed meshes, plus the mask loss: L = L_L + lambda_S L_S."""
+    """Trains with the layout loss of deformed meshes and the mask loss: L = L_L + lambda_S L_S."""
 
     stage: ShapeConfig
     loss: LossConfig

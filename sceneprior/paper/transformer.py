@@ -33,7 +33,7 @@ class TransformerConfig(DecoderConfig):
     query_self_attention: bool = False
     """Give the decoder layer self-attention over its single query z, as in the released code."""
     step_mlps: bool = False
-    """End each step k with a two-layer MLP of its own, as in the released code: 0.5 million weights
+    """End each step k with a separate two-layer MLP, as in the released code: 0.5 million weights
     per step at width 512. Features then depend on k."""
 
     def build(self, width: int, max_objects: int) -> "SceneTransformer":
@@ -51,7 +51,7 @@ class FeedForward(nn.Module):
         self.dropout = dropout
 
     def repeated(self, rows: Sequence[int]) -> Layer:
-        """The function, for several inputs one after the other, of so many rows each."""
+        """This block as a function for several inputs in turn, whose numbers of rows are `rows`."""
         expand, contract = (repeated(layer, rows) for layer in (self.expand, self.contract))
         p = self.dropout if self.training else 0.0
 
@@ -76,13 +76,13 @@ class SceneTransformer(nn.Module):
     the norm after the residual connection, as in the library that the paper builds on.
 
     Three shortcuts save time and are exact. Encoder: an object's query, key and value do not
-    change, so each is computed once and appended, the value already multiplied by each head's share
-    of the output projection. Attention and all that follows it are computed again in each step,
-    since earlier objects also attend to later ones: its time grows with the square of the number of
-    objects. Decoder: all steps share the one query z, so instead of projecting every context token
-    to a key and a value, z's query is multiplied by the key projection once, and the value
-    projection is applied to the single weighted sum. Gradients: those of the weights are one
-    product over all steps (`RepeatedLinear`). `width` is D_z.
+    change, so each is computed once and appended; the value is stored multiplied by each head's
+    share of the output projection. Attention and the later layers are computed again in each step,
+    because earlier objects also attend to later ones, so their time grows with the square of the
+    number of objects. Decoder: all steps share the one query z, so instead of projecting every
+    context token to a key and a value, z's query is multiplied by the key projection once, and the
+    value projection is applied to the single weighted sum. Gradients of the weights: one product
+    over all steps (`RepeatedLinear`). `width` is D_z.
     """
 
     def __init__(self, width: int, config: TransformerConfig, max_objects: int):
@@ -160,8 +160,8 @@ class SceneTransformer(nn.Module):
         return self.query(z * z.shape[-1] ** 0.5)
 
     def _reader(self, rows: Sequence[int]) -> Callable[[Tensor], list[Tensor]]:
-        """The function that makes a token of the newest object x_k: (rooms, 1, width) the token,
-        and (rooms, heads, 1, *) its queries, keys, and values times the output projection."""
+        """Make a function that encodes the newest object x_k as a token, (rooms, 1, width), and its
+        queries, keys, and values times the output projection, (rooms, heads, 1, *)."""
         project = repeated(self.encoder_qkv, rows)
         output = self.encoder_out.weight.T.unflatten(0, (self.heads, -1))
         projected = RepeatedLinear(output, None, rows)
@@ -174,7 +174,7 @@ class SceneTransformer(nn.Module):
         return read
 
     def _encoder(self, rows: Sequence[int]) -> Callable[..., Tensor]:
-        """The function from all tokens that `read` made to the scene context F_k."""
+        """Make a function that maps all tokens of `_reader` to the scene context F_k."""
         feed_forward = self.encoder_ff.repeated([k * rooms for k, rooms in enumerate(rows, 1)])
 
         def encode(tokens: Tensor, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
@@ -188,7 +188,7 @@ class SceneTransformer(nn.Module):
         return encode
 
     def _decoder(self, rows: Sequence[int]) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
-        """The function from z's queries and the context F_k to the next object x_k."""
+        """Make a function that maps z's queries and the context F_k to the next object x_k."""
         value = self.decoder_value.weight.unflatten(0, (self.heads, -1)).transpose(1, 2)
         values = RepeatedLinear(value, self.decoder_value.bias.view(self.heads, -1), rows)
         out, feed_forward = repeated(self.decoder_out, rows), self.decoder_ff.repeated(rows)
@@ -222,6 +222,6 @@ def _first(values: Tensor, rooms: int) -> Tensor:
 
 
 def repeated(layer: nn.Linear, rows: Sequence[int]) -> Layer:
-    """The layer, for several inputs one after the other, of so many rows each."""
+    """The layer as a function for several inputs in turn, whose numbers of rows are `rows`."""
     product = RepeatedLinear(layer.weight.T.unsqueeze(0), layer.bias.unsqueeze(0), rows)
     return lambda x: product(x.flatten(0, -2).unsqueeze(0)).view(*x.shape[:-1], layer.out_features)

@@ -22,7 +22,7 @@ WALL, DOOR, WINDOW = (90, 86, 80), (176, 120, 60), (90, 160, 215)
 
 
 def floor_plan(scene: Scene) -> UInt8[np.ndarray, "512 662 3"]:
-    """The room from straight above, wholly in the picture whatever its size; +x is right, +z down.
+    """Draw a whole room from straight above, scaled to fit the picture; +x is right, +z down.
 
     Objects have flat class colours and dark borders, and the highest surface hides what is below
     it. To the right stand a legend of the classes and a scale bar.

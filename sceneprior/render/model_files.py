@@ -21,12 +21,12 @@ TEXTURES = (
 def load_parts(
     path: Path, file_type: str | None = None, with_materials: bool = True
 ) -> dict[str, Textured]:
-    """The meshes of a GLB or an OBJ by node name, placed by their nodes.
+    """The meshes of a GLB or an OBJ by node name, with the transforms of their nodes applied.
 
-    A damaged file raises any exception.
+    A damaged file may raise any exception.
 
     Args:
-        file_type: Format of the file; None for that of its suffix.
+        file_type: Format of the file; None uses its suffix.
     """
     import trimesh
 
@@ -45,8 +45,8 @@ def load_parts(
 
 
 def joined(parts: Iterable[Textured]) -> Mesh:
-    """One mesh of all parts, without the seams of textures, along which files repeat vertices, so
-    that closed meshes are open."""
+    """Join parts into one closed mesh. Files repeat vertices along the seams of textures, which
+    opens closed meshes, so such vertices are merged."""
     meshes = [_without_seams(part.mesh) for part in parts]
     starts = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes)])
     faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
@@ -55,8 +55,8 @@ def joined(parts: Iterable[Textured]) -> Mesh:
 
 
 def _without_seams(mesh: Mesh) -> Mesh:
-    """The mesh with equal vertices merged where edges have one face only. Other equal vertices stay
-    apart, since they may belong to closed solids that touch."""
+    """Merge equal vertices of edges that have only one face. Other equal vertices stay separate,
+    since they may belong to closed solids that touch."""
     faces = np.asarray(mesh.faces)
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     edges, sharing = np.unique(edges, axis=0, return_counts=True)
@@ -71,14 +71,14 @@ def _without_seams(mesh: Mesh) -> Mesh:
 
 
 def _surface(visual: Any) -> tuple[Any, np.ndarray | None]:
-    """The material of a visual of trimesh, and texture coordinates if it has images; (None, None)
-    if the file defines none."""
+    """Material of a trimesh visual, and its texture coordinates if it has images; (None, None) if
+    the file defines no material."""
     from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
     material = getattr(visual, "material", None)
     if isinstance(material, SimpleMaterial):
         image, color = material.image, material.kwargs.get("kd")
-        # trimesh makes up a material, with an image of 2 x 2 pixels, where an OBJ names none.
+        # Where an OBJ names no material, trimesh invents one with an image of 2 x 2 pixels.
         image = image if image is not None and max(image.size) > 2 else None
         if color is None and image is None:
             return None, None
@@ -100,8 +100,8 @@ def _surface(visual: Any) -> tuple[Any, np.ndarray | None]:
 
 
 def _small(image: Any) -> Any:
-    """A texture with at most `LARGEST_PX` pixels along each side, in colours that PNG has."""
-    image.load()  # a damaged image is an error here, not when a room is written
+    """A texture with at most `LARGEST_PX` pixels along each side, in a colour mode of PNG."""
+    image.load()  # read now, so that a damaged image raises here, not when a room is written
     if image.mode not in ("L", "RGB", "RGBA"):
         image = image.convert("RGBA" if "transparency" in image.info else "RGB")
     if max(image.size) > LARGEST_PX:

@@ -44,8 +44,8 @@ def save_scene(scene: Scene, path: Path, shell: ShellName = "none") -> None:
     of the whole room. 3D formats keep the axes and the unit of the room frame: y up, metres.
 
     Args:
-        shell: With `walls`, models have nodes `floor`, `wall_0` and so on, and `ceiling`; with
-            `floor`, the first alone.
+        shell: With `walls`, 3D files also have nodes `floor`, `wall_0` and so on, and `ceiling`;
+            with `floor`, only the node `floor`.
 
     Raises:
         InputError: the path has another suffix.
@@ -94,8 +94,8 @@ FACING = ("class", "yaw_rad", "yaw_confidence")
 
 
 def glb_extras(scene: Scene) -> dict[str, Any]:
-    """What a GLB says of its scene: name, label set, `extra`, and each object's node and class,
-    with its yaw where it is known (docs/conventions.md)."""
+    """Metadata of a scene in its GLB: name, label set, `extra`, and each object's node and class,
+    with its yaw where known (docs/conventions.md)."""
     entries = scene_to_json(scene)["objects"]
     objects = [
         {"node": node} | {key: entry[key] for key in FACING if key in entry}

@@ -28,7 +28,7 @@ def scene_to_usd(scene: Scene, shell: Mapping[str, Mesh], physics: bool = False)
     in `userProperties:class` and its mesh as the child `shape`; meshes of the shell are children of
     `/room`. With `physics`, objects are rigid bodies with a mass, unless they hang, and the convex
     bodies of `core/colliders.py` are their colliders: cubes, cylinders and convex hulls, which are
-    not drawn. The shell collides as it is.
+    not drawn. Meshes of the shell are colliders themselves.
 
     Raises:
         InputError: `usd-core` is not installed.
@@ -80,7 +80,7 @@ def _define_mesh(
     color: np.ndarray | None,
     origin_m: tuple[float, float, float],
 ) -> Any:
-    """A mesh prim, relative to `origin_m`; without a colour, one that is not drawn."""
+    """A mesh prim, relative to `origin_m`; without a colour, it is not drawn."""
     from pxr import Gf, UsdGeom, Vt
 
     prim = UsdGeom.Mesh.Define(stage, path)

@@ -35,7 +35,7 @@ class TopDownProtocol:
     camera_height_m: float = 10.0
     """The camera's height above the floor; nothing above it is drawn."""
     background: tuple[int, int, int] = BACKGROUND
-    """RGB of pixels without an object. The floor is not drawn: not all methods make one."""
+    """RGB of pixels without an object. The floor is not drawn: not all methods generate one."""
 
     @property
     def metres_per_pixel(self) -> float:
@@ -73,7 +73,7 @@ def scene_meshes(scene: Scene) -> list[Mesh]:
 
 
 def object_colors(scene: Scene) -> UInt8[np.ndarray, "objects 3"]:
-    """The quiet RGB colour of each object's class, for pictures and files that people look at."""
+    """Muted RGB colour of each object's class, for pictures and files that people look at."""
     return quiet_colors([item.label for item in scene.objects])
 
 
@@ -103,7 +103,7 @@ def topdown(
 
     Image right is +x, image down is +z, and the room's origin is the centre of the image. Where
     objects overlap, the highest surface is drawn. If `protocol` is None, the protocol of the
-    scene's label set is used. `outlines` darkens the borders between objects and takes quiet
+    scene's label set is used. `outlines` darkens the borders between objects and uses muted
     colours; such pictures are for readers, not for metrics.
 
     Source:
@@ -146,7 +146,7 @@ class CornerView:
     image_size: tuple[int, int]
     floor: Mesh
     walls: tuple[Mesh, ...] = ()
-    """Walls of one room behind its furniture, as the camera sees it."""
+    """Walls of a single room that lie behind its furniture, as seen from the camera."""
 
 
 def room_view(scene: Scene, image_size: tuple[int, int] = (360, 480)) -> CornerView:

@@ -26,8 +26,8 @@ _RESUMED = ("epoch", "global_step", "loops", "optimizer_states", "pytorch-lightn
 def find_checkpoint(run: Path, stages: Sequence[str]) -> tuple[str, Path]:
     """Stage and path of the checkpoint that commands load; `stages` are the run's, in order.
 
-    It is the checkpoint of the last finished stage. If no stage is finished, it is the newest
-    checkpoint of the last stage begun.
+    The last finished stage is chosen; if no stage is finished, the newest checkpoint of the last
+    stage begun.
     """
     for name in ("final.ckpt", "last.ckpt"):
         for stage in reversed(stages):

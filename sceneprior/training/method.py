@@ -36,8 +36,8 @@ OF_SHARDS = "shards"
 
 @dataclass(frozen=True)
 class Stage:
-    """A LightningModule to train, and its training data. The attribute `prior` of the module is the
-    network; `latents`, if it has one, is the table of the rooms' latents."""
+    """A LightningModule to train, and its training data. The module's attribute `prior` is the
+    network; `latents`, if present, is the table of the rooms' latents."""
 
     name: str
     """Name of the stage, and of its folder in the run."""
@@ -68,7 +68,7 @@ class RunConfig(Section, ABC):
 
     @property
     def learns_from(self) -> str:
-        """Supervision that training gets from its rooms, in words."""
+        """Description of the supervision that training uses."""
         return "masks in 2D"
 
     @model_validator(mode="after")
@@ -103,8 +103,9 @@ class RunConfig(Section, ABC):
 
     @abstractmethod
     def networks(self, stage: str, rooms: int) -> nn.ModuleDict:
-        """The modules that commands load from a stage's checkpoint of this many rooms, freshly
-        initialised from the seed: `prior`, and `latents` and `sampler` if any."""
+        """Build the modules that commands load from a stage's checkpoint: `prior`, and `latents`
+        and `sampler` if any. They are freshly initialised from the seed; `rooms` is the number of
+        training rooms."""
 
     @abstractmethod
     def trained(self, networks: nn.Module, stage: str, room_ids: tuple[str, ...]) -> "Trained":
@@ -132,7 +133,7 @@ class RunConfig(Section, ABC):
 
 @runtime_checkable
 class Trained(Protocol):
-    """Networks of a run, ready for use: a class of the method's own, or `TrainedSampler` or
+    """Networks of a run, ready for use: a method's own class, or `TrainedSampler` or
     `TrainedReconstructor`."""
 
     @property

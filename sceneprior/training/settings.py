@@ -16,7 +16,7 @@ class DataConfig(Section):
     view_fraction: float = Field(1.0, gt=0, le=1)
     """Share of each room's views that training may use (the paper's Table 4: 0.25, 0.5, 1)."""
     augment_rotations: bool = True
-    """Add each room turned by 90, 180 and 270 degrees, each with its own latent."""
+    """Add each room rotated by 90, 180 and 270 degrees, each with its own latent."""
     mask_step: int = Field(4, ge=1)
     """Masks are compared at 1 / mask_step of the rendered resolution (paper: 4)."""
     workers: int = Field(0, ge=0)

@@ -18,7 +18,7 @@ def first_process() -> bool:
 
 
 def slurm_plugins() -> list[Any]:
-    """Lightning's SLURM environment, without its own requeueing.
+    """Lightning's SLURM environment, with requeueing turned off.
 
     Lightning's requeueing saves in the middle of an epoch, where a run cannot be resumed exactly,
     and into the current folder, where the next stage would mistake the file for its own.
@@ -40,7 +40,7 @@ def requeue_on_signal() -> Iterator[None]:
         return
 
     def leave(number: int, frame: object) -> None:
-        signal.signal(number, signal.SIG_IGN)  # srun may send it a second time
+        signal.signal(number, signal.SIG_IGN)  # srun may send the signal twice
         if first_process():
             # Requeued first, while there is time: SLURM then sends SIGTERM.
             subprocess.run(["scontrol", "requeue", _job()], check=False)

@@ -51,7 +51,7 @@ def make_loader(
     rank: int = 0,
     world: int = 1,
 ) -> DataLoader:
-    """Make a loader of batches: `SceneViews` of a `ViewDataset`, or `RoomBoxes` of true boxes.
+    """Make a loader of `SceneViews` (from a `ViewDataset`) or `RoomBoxes` (of true boxes).
 
     `workers` processes prefetch masks. Without masks, no workers are used, because boxes and
     cameras are already in memory or on the GPU.

@@ -33,7 +33,7 @@ class RoomDataset(Dataset):
     max_objects: int
     """Largest number of objects in a room."""
     counted: ClassVar[str]
-    """Name of the things that `max_objects` counts, for messages."""
+    """Plural noun for the objects that `max_objects` counts, for messages."""
     masks: MaskStore | None = None
     """Images to read; if None, batches are made in the training process, on its device."""
 
@@ -159,7 +159,7 @@ def allowed_views(
 ) -> Int64[np.ndarray, " views"]:
     """Indices of a room's views that training may use: a random share, determined by `seed`.
 
-    If `held_out`, the indices of the other views instead.
+    With `held_out`, return the indices of the other views.
     """
     keep = max(1, round(fraction * count))
     order = np.random.default_rng([seed, room]).permutation(count)

@@ -147,7 +147,7 @@ def _find_sides(
     in_front = z0 - reach >= MIN_DEPTH_M
     ahead = z0 + reach > MIN_DEPTH_M
     # A shear u -> u - shear at fixed Z simplifies the formulas and avoids cancellation. It moves
-    # the centre of an ellipsoid in front to u = 0, and aligns the axes of a cut one with X and Z.
+    # the centre of an ellipsoid in front to u = 0, and aligns a cut ellipsoid with X and Z.
     lean = (spread[:2] * dz).sum(dim=1) / reach_sq
     shear = torch.where(in_front, middle[:2] / z0, torch.where(ahead, lean, 0))
     dx = spread[:2] - shear.unsqueeze(1) * dz

@@ -7,19 +7,18 @@ from jaxtyping import Float
 from sceneprior.core.parts import BOX, SQUARE, Parts
 
 SLIVER = 1e-3
-"""Steps, as a share of the box, in which the sides of blended solids move. A mesh would have faces
-without area where one side is ahead of another by less than parts overlap (`part_meshes.OVERLAP`).
-"""
+"""Grid, as a share of the box, to which the ends of blended solids are rounded. Ends that differ by
+less than the overlap of parts (`part_meshes.OVERLAP`) would give the mesh faces of zero area."""
 OTHER_KIND = 1e3
-"""Cost of a pair of two kinds, which exceeds that of all other pairs together."""
+"""Cost of pairing solids of different kinds; larger than all other costs together."""
 DECIMALS = 6
-"""Decimals to which costs and places are rounded, so that ties are ties on every machine."""
+"""Decimals to which costs and places are rounded, so that ties are resolved alike everywhere."""
 
 
 def blend_parts(a: Parts, b: Parts, share: float) -> Parts:
-    """The object between two matched ones (`matched_parts`) that has `share` of `b`, from 0 to 1.
+    """Blend two matched objects (`matched_parts`): `a` at share 0, `b` at share 1.
 
-    The shares 0 and 1 give `a` and `b`. All solids together reach as far as the share demands.
+    The bounding box of all solids changes linearly with `share`.
     """
     if share in (0, 1):
         return b if share else a
@@ -40,12 +39,12 @@ def _bounds(ends: Float[np.ndarray, "solids 3 2"]) -> Float[np.ndarray, "2 3"]:
 
 
 def matched_parts(a: Parts, b: Parts) -> tuple[Parts, Parts]:
-    """The same two objects with equally many solids and corners, which correspond by their order.
+    """Give two objects equally many solids and outline corners, which correspond by index.
 
-    Mirror images become solids of their own. Solids of one kind are paired one to one at the least
-    sum of squared differences between their ends. The partner of any other solid is the same solid,
-    squeezed into the nearest box of the other object, where it is hidden; if the other object has
-    no box, it is the solid's own centre. The order of the parts makes no difference.
+    Mirror images become separate solids. Solids of the same kind are paired one to one, with the
+    least sum of squared differences between their ends. An unpaired solid gets a copy of itself as
+    its partner, hidden in the nearest box of the other object, or squeezed into its own centre if
+    the other object has no box. The order of the parts does not matter.
     """
     from scipy.optimize import linear_sum_assignment
     from scipy.spatial.distance import cdist
@@ -71,8 +70,8 @@ def matched_parts(a: Parts, b: Parts) -> tuple[Parts, Parts]:
 
 
 def _solids(parts: Parts) -> Float[np.ndarray, "solids 7"]:
-    """Kind and ends of each solid, in an order that depends on the solids alone; a part in the
-    middle, which is its own mirror image, once."""
+    """Kind and ends of each solid, sorted. A part that equals its own mirror image is listed
+    once."""
     rows = np.array([[kind, *ends.ravel()] for kind, ends in parts.solids()])
     _, first = np.unique(rows.round(DECIMALS), axis=0, return_index=True)
     return rows[first]
@@ -98,10 +97,10 @@ def _hidden(
 def matched_outlines(
     a: Float[np.ndarray, "a 2"], b: Float[np.ndarray, "b 2"]
 ) -> tuple[Float[np.ndarray, "corners 2"], Float[np.ndarray, "corners 2"]]:
-    """The same two outlines with equally many corners, which correspond by their order.
+    """Give two outlines equally many corners, which correspond by index.
 
-    The points of two outlines that are nearest to one corner of the square correspond, and between
-    them, points at equal shares of the length.
+    Corners of the result lie at corresponding points. The points nearest to a corner of the square
+    correspond, and so do points at equal shares of the length between them.
     """
     if np.array_equal(a, b):
         return a, b
@@ -111,8 +110,8 @@ def matched_outlines(
 
 
 class _Around:
-    """Places on an outline, from 0 to 4: whole numbers are the points nearest to the corners of
-    `SQUARE`, in its order."""
+    """Parametrises an outline by places from 0 to 4: whole numbers are the points nearest to the
+    corners of `SQUARE`, in its order."""
 
     def __init__(self, outline: Float[np.ndarray, "corners 2"]):
         self.closed = np.concatenate([outline, outline[:1]])
@@ -121,7 +120,7 @@ class _Around:
         ring, whole = shapely.LinearRing(outline), self.lengths[-1]
         nearest = np.array([ring.project(shapely.Point(corner)) for corner in SQUARE])
         self.start = nearest[0]
-        # Nearest points follow each other as the corners do; rounding may swap equal ones.
+        # Nearest points are in the order of the corners; rounding may swap equal ones.
         ahead = np.maximum.accumulate(((nearest - self.start) / whole).round(DECIMALS) % 1)
         self.knots = np.append(ahead, 1) * whole
         own = np.interp((self.lengths[:-1] - self.start) % whole, self.knots, np.arange(5.0))

@@ -19,7 +19,7 @@ solid."""
 THIN_M = 0.08
 """Thickness up to which a part keeps its size in metres when its object is stretched."""
 MOST_THIN = 0.7
-"""Share of an axis that such parts may take; beyond it, they are stretched, too."""
+"""Largest share of an axis that such parts may take together; beyond it, they are stretched."""
 
 
 def surface_of_parts(
@@ -30,7 +30,7 @@ def surface_of_parts(
 
     The mesh is closed: every edge belongs to two triangles.
     """
-    from manifold3d import Manifold, OpType  # imported here: reading a scene needs none
+    from manifold3d import Manifold, OpType  # imported here: reading a scene does not need it
 
     solids = [_solid(kind, ends) for kind, ends in parts.solids()]
     united: Manifold = Manifold.batch_boolean(solids, OpType.Add)
@@ -59,7 +59,7 @@ def triangles_of(
 
 
 def prism(outline: Float[np.ndarray, "corners 2"], low: float, high: float) -> "Manifold":
-    """The upright solid over an outline (x, z), which may run either way, between two heights."""
+    """The upright solid over an outline (x, z) of either orientation, between two heights."""
     from manifold3d import CrossSection, FillRule
 
     flat = CrossSection([np.asarray(outline, np.float64)], FillRule.NonZero)
@@ -99,9 +99,9 @@ def stretched(
     size_m: Float[np.ndarray, "3"],
     new_size_m: Float[np.ndarray, "3"],
 ) -> Float[np.ndarray, "points 3"]:
-    """Points of an object, in the frame of its box, after the box gets other extents: what is thin
-    keeps its thickness in metres, and the rest is stretched. The result is in the frame of the new
-    box."""
+    """Stretch points of an object, in the frame of its box, to a box of other extents. Thin parts
+    keep their thickness in metres, and the rest is stretched. The result is in the frame of the
+    new box."""
     moved = np.empty_like(points)
     solids = np.stack([ends for _, ends in parts.solids()])
     for axis in range(3):

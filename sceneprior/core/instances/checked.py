@@ -23,7 +23,7 @@ def checked(model: type[_M], data: Any, where: str) -> _M:
         if first["type"] == "value_error":
             raise InputError(f"{where}: {first['ctx']['error']}") from None
         key, reason = ".".join(map(str, first["loc"])) or "it", first["msg"]
-        if first["type"] == "model_type":  # the sentence of Pydantic names our class
+        if first["type"] == "model_type":  # Pydantic's message names our class
             reason = "expected a JSON object"
         raise InputError(
             f"{where}: {key} is {shown(first['input'])}; {reason[:1].lower()}{reason[1:]}."
@@ -34,7 +34,7 @@ def number_array(value: Any) -> np.ndarray:
     """Convert nested lists of numbers to float64.
 
     Raises:
-        TypeError: an entry is a text, null or too large a number.
+        TypeError: an entry is a string, null or too large a number.
         ValueError: rows have different lengths.
     """
     array = np.array(value)

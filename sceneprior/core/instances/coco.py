@@ -86,7 +86,7 @@ def read_coco(path: Path) -> tuple[np.ndarray, dict[int, str]]:
 
 
 def read_coco_json(path: Path) -> dict[str, Any]:
-    """Read a JSON that is an object, as all COCO's files of annotations are."""
+    """Read a JSON of COCO annotations; its top level must be an object."""
     data = read_json(path)
     if not isinstance(data, dict):
         raise InputError(
@@ -109,7 +109,7 @@ def check_size(size: tuple[int, int], where: str) -> None:
 def paint(masks: Iterable[tuple[int, np.ndarray]], size: tuple[int, int]) -> np.ndarray:
     """Image of ids, (height, width) int32, of (id, mask) pairs whose masks may overlap.
 
-    The mask with fewer pixels is in front, like a cup on a table; of equally large ones, the later.
+    The mask with fewer pixels is in front, like a cup on a table; in a tie, the later mask is.
     """
     ids = np.zeros(size, dtype=np.int32)
     pixels_of_front = np.full(size, np.iinfo(np.int32).max, dtype=np.int32)

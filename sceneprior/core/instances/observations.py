@@ -10,12 +10,12 @@ from sceneprior.core.classes import VOID
 from sceneprior.core.shards import RoomViews, Sightings, thinned_stuff
 
 MIN_BOX_SIDE_PX = 4
-"""Longest side of a mask's box, in pixels, at which the mask still counts as not visible: an object
-is visible in a view if both sides of its box are longer."""
+"""Limit on the sides of a mask's box, in pixels: an object counts as visible in a view if both
+sides are longer."""
 
 TOUCH_PX = 4
-"""Distance in pixels up to which another object is taken to touch the outermost pixels of a mask,
-so that it may occlude the masked object."""
+"""Distance in pixels within which another object counts as touching a side of a mask, so that it
+may occlude the masked object."""
 
 
 @dataclass(frozen=True)

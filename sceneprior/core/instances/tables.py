@@ -83,7 +83,7 @@ def _json_rows(path: Path, content: str) -> Iterable[tuple[str, str]]:
 
 
 class _Pairs(list[tuple[str, Any]]):
-    """A JSON object as (key, value) pairs; a type of its own, to tell it from a JSON list."""
+    """A JSON object as (key, value) pairs; a separate type, to distinguish it from a JSON list."""
 
 
 def _listed_row(row: Any) -> tuple[str, Any]:

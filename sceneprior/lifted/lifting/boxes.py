@@ -1,4 +1,4 @@
-"""The smallest 3D box of each tracked object that explains its masks in all views."""
+"""Finds the smallest 3D box of each tracked object that explains its masks in all views."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Real
@@ -8,12 +8,12 @@ from sceneprior.lifted.lifting.hulls import MOST_EMPTY, Sightings, carve, cells_
 from sceneprior.lifted.lifting.lifted import LiftedBoxes
 
 GRIDS = ((16, 0.6), (24, 0.6), (40, 0.4), (40, 0.4))
-"""Cells along an edge and their `reach` (see `carve`), coarse to fine: each grid spans the box
-found on the previous one, and a cell more at each side."""
+"""Grids, coarse to fine: cells along an edge, and `reach` (see `carve`). Each grid spans the box
+found on the previous grid, plus one cell at each side."""
 EXPLAINED = 0.985
 """Share of an object's rays that its hull must meet; the others may be wrong pixels."""
 RAYS = 400
-"""Rays per object, about; see `own_rays`."""
+"""Approximate number of rays per object; see `own_rays`."""
 TRIM = 0.3
 """Distance in cells by which a box's sides are moved inwards from its outermost cells, which are
 only partly filled."""
@@ -27,9 +27,10 @@ def lift_boxes(
 ) -> LiftedBoxes:
     """3D boxes of a room's objects, from instance ids and cameras; no 3D ground truth is used.
 
-    An object's visual hull is carved coarse to fine. On each grid, its box is shrunk, side after
-    side, as long as every ray through one of its pixels meets a cell of the hull inside; the next
-    grid spans this box, and leaves out what else the views fail to rule out.
+    An object's visual hull is carved coarse to fine. On each grid, the sides of the box are moved
+    inwards one after another, as long as every ray through one of the object's pixels still meets
+    a cell of the hull inside the box. The next grid spans only this box, which drops the parts of
+    the hull that no ray needs.
 
     `views` is a room, read with its images, of which only the views `chosen` are used (None: all).
     `seed` chooses the pixels whose rays are used.
@@ -112,9 +113,9 @@ def own_rays(
 ) -> tuple[Float[np.ndarray, "rays 3"], Float[np.ndarray, "rays 3"]]:
     """Origins and unit directions of rays through an object's pixels.
 
-    About `RAYS` of them go through random pixels of its masks. In every view, further rays go
-    through the outermost pixel at each side that is the object's own rather than an occluder's:
-    they determine its extent.
+    About `RAYS` of them go through random pixels of the object's masks. In every view, further rays
+    go through the outermost pixel at each side where the object itself ends, rather than where an
+    occluder cuts it off; these rays determine the object's extent.
     """
     each = max(4, RAYS // len(poses))
     origins, directions = [], []
@@ -144,8 +145,8 @@ def pixel_directions(
 def _where_to_look(
     views: RoomViews, rows: Int[np.ndarray, " views"], item: int
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """A cube that contains the object, around the point nearest to the rays through its 2D boxes'
-    centres."""
+    """Lower and upper corner of a cube that contains the object. Its centre is the point nearest to
+    the rays through the centres of the object's 2D boxes."""
     height, width = views.image_size
     boxes_px = views.boxes[rows, item] * np.array([width, height, width, height])
     poses, intrinsics = views.world_to_camera[rows], views.intrinsics[rows]

@@ -29,13 +29,13 @@ from sceneprior.lifted.prototypes import Prototypes, choose_prototypes, turned_l
 VERSION = 2
 """Version of the cached boxes."""
 SHAPES_VERSION = 5
-"""Version of the cached hulls and rays. Raise it, or `VERSION`, when the same views give others."""
+"""Version of the cached hulls and rays. Increase this, or `VERSION`, when results change."""
 
 WALLS_VERSION = 1
 """Version of the cached walls."""
 
 RAYS_KEPT = 1024
-"""Rays per object from which shapes are found."""
+"""Number of rays per object from which its shape is found."""
 
 
 class LiftedDataset(RoomDataset):
@@ -115,7 +115,7 @@ class LiftedDataset(RoomDataset):
         return np.where(self.usable[:, None], sizes_m, 1.0)
 
     def find_prototypes(self, most: int) -> Prototypes:
-        """At most `most` prototypes, in parts, that represent the shapes of all usable objects."""
+        """Choose at most `most` prototypes, made of parts, that represent all usable objects."""
         # Imported only where something is lifted, here and below, since Numba is slow to import.
         from sceneprior.lifted.lifting.kinds import fit_kinds
 
@@ -280,8 +280,8 @@ def _find_walls(
 
 
 def _kept(path: Path, key: str, find: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """The arrays cached in a file under this key; otherwise they are computed, and cached if the
-    file is writable."""
+    """Read the arrays cached in a file under this key. If they are missing, compute them, and cache
+    them if the file is writable."""
     try:
         with np.load(path) as saved:
             if str(saved["key"]) == key:
@@ -299,9 +299,8 @@ def _kept(path: Path, key: str, find: Callable[[], dict[str, np.ndarray]]) -> di
 def _fingerprint(
     rooms: Sequence[RoomViews], checksums: Sequence[str | None], chosen: Sequence[np.ndarray]
 ) -> str:
-    """Hash of everything that boxes and shapes are computed from. A room's checksum covers its
-    images; some old shards lack it, and there the measurements taken from the images stand in for
-    it."""
+    """Hash of everything from which boxes and shapes are computed. A room's checksum covers its
+    images; for old shards without checksums, measurements taken from the images replace it."""
     summary = hashlib.sha256(f"lifted {VERSION}".encode())
     for room, checksum, views in zip(rooms, checksums, chosen, strict=True):
         summary.update(f"{room.room_id} {checksum}".encode())

@@ -33,7 +33,8 @@ class Sightings(NamedTuple):
     """First column and row of the object's pixels, and one past the last of each."""
     own_before: Int[np.ndarray, " corners"]
     """Summed-area tables of the object's pixels in its 2D box: for each pixel corner, the number of
-    its pixels above and to the left. (height + 1) x (width + 1) of the box, view after view."""
+    the object's pixels above and to the left. Tables have (height + 1) x (width + 1) entries of the
+    box, and follow each other view by view."""
     table_starts: Int[np.ndarray, " views"]
     """Start of each view's table in `own_before`."""
     world_to_image: Float[np.ndarray, "views 3 4"]
@@ -47,9 +48,9 @@ class Hull(NamedTuple):
     low_m: Float[np.ndarray, "3"]
     high_m: Float[np.ndarray, "3"]
     emptiness: Float[np.ndarray, "x y z"]
-    """Share of the views with evidence on a cell that see past it, half a view subtracted from
-    these; `NEVER` for a cell that `carve` rules out. The hull is the cells up to a threshold, which
-    `boxes.py` and `shapes.py` choose, since masks have errors."""
+    """Share of the views with evidence about a cell that see past it, after half a view is
+    subtracted from these; `NEVER` for a cell that `carve` rules out. The hull consists of the cells
+    up to a threshold, which `boxes.py` and `shapes.py` choose, since masks have errors."""
 
     @property
     def cell_m(self) -> Float[np.ndarray, "3"]:
@@ -90,8 +91,8 @@ def carve(
     view more is allowed), or if fewer than two see the object there.
 
     A view sees past a cell if the pixel there is background and no pixel of the object lies within
-    `reach` cells of it, so that parts thinner than a cell survive. A pixel of another object is no
-    evidence: that object may be an occluder. Neither is a cell outside the image.
+    `reach` cells of it, so that parts thinner than a cell survive. Pixels of other objects, which
+    may be occluders, are no evidence, and neither are cells outside the image.
     """
     emptiness = np.empty((cells, cells, cells), dtype=np.float32)
     in_threads(

@@ -1,4 +1,4 @@
-"""Kinds of furniture: the parts of each prototype, and the look that best explains each object."""
+"""Fits the parts of each prototype, and finds the look that best explains each object's rays."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -23,9 +23,9 @@ from sceneprior.lifted.prototypes import (
 from sceneprior.render.silhouettes.cpu.threads import in_threads, thread_count
 
 RAYS = 4096
-"""Rays to which the parts of a kind are fitted."""
+"""Number of rays to which the parts of a prototype are fitted."""
 MOST = 16
-"""Maximum number of pairs of an object and a pose whose rays are used for a kind."""
+"""Maximum number of (object, pose) pairs whose rays are used for a prototype."""
 SYMMETRIC = 0.05
 """Margin over an object's smallest distance to the prototype within which other poses are used,
 too, as for symmetric objects."""
@@ -45,7 +45,7 @@ def fit_kinds(
     hangs: Bool[np.ndarray, " objects"],
     margin: float,
 ) -> tuple[Parts, ...]:
-    """Parts of the prototypes, which are the objects `items`.
+    """Fit parts to the prototypes, which are the objects `items`.
 
     The parts of a prototype are fitted to the rays of all objects of its class that are similar to
     it (`ALIKE`), each in its most similar pose and, for symmetric objects, in other poses that are
@@ -80,7 +80,7 @@ def fit_kinds(
 
 
 def as_prototype(rays: RayPool, pose: int) -> RayPool:
-    """Rays of an object whose look is a prototype in this pose, in the prototype's frame."""
+    """Transform an object's rays to the frame of a prototype that the object shows in this pose."""
     quarters, mirrored = turn_of(pose)
     back = quarter_rotation(quarters) * [-1 if mirrored else 1, 1, 1]
     starts, spans = (part.astype(np.float64) @ back for part in rays[:2])
@@ -98,7 +98,7 @@ def looks_of(
 
         share of the object's rays explained wrongly + `SIZE_WEIGHT` (L1 distance of log extents).
 
-    Of equal looks, the first is taken; -1 if the object's class has no prototype.
+    Ties give the first look. The result is -1 if the object's class has no prototype.
     """
     looks = np.full(len(object_class), -1, dtype=np.int64)
     offered = {}

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 HANGS_M = 0.3
-"""Height of an object's bottom from which it hangs; everything lower stands on the floor."""
+"""Height of the lower side above which an object counts as hanging; others stand on the floor."""
 
 
 class LiftedBoxes(NamedTuple):
@@ -30,13 +30,13 @@ class ShapeGrid(NamedTuple):
 
 
 class RayPool(NamedTuple):
-    """Segments of rays in the frames of one or more objects, which span [-1, 1]; as many for each
-    object."""
+    """Segments of rays in the frames of one or more objects, which span [-1, 1]; the same number of
+    rays for each object."""
 
     starts: Float[np.ndarray, "*objects rays 3"]
     """Points at which the rays enter the frame."""
     spans: Float[np.ndarray, "*objects rays 3"]
-    """Vector from there to the point where the ray leaves the frame or its course becomes unknown;
-    0 for a ray without information."""
+    """Vector from the start to the point where the ray leaves the frame, or beyond which nothing is
+    known; 0 for a ray without information."""
     hits: Bool[np.ndarray, "*objects rays"]
     """True if the object is met on the segment; otherwise the whole segment is empty."""

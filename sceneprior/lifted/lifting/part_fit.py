@@ -1,7 +1,7 @@
-"""Greedy search for the few parts that explain the rays of one kind of furniture.
+"""Greedy search for the few parts that explain the rays of one prototype.
 
-Each step tries all changes on a subset of the rays and the best of these changes on all rays. The
-best one is kept; the search ends when no change lowers the loss (`part_loss.py`).
+Each step tries all changes on a subset of the rays, and the best of them on all rays. The best
+change is kept; the search ends when no change lowers the loss (`part_loss.py`).
 """
 
 import itertools
@@ -37,8 +37,8 @@ SHORTEST = 4
 PIECES = 4
 """Number of uncovered pieces of the hull, the largest first, in which new parts are tried."""
 SCREENED, FINALISTS = 768, 6
-"""Number of rays on which all changes are tried, and of the best changes that are then tried on all
-rays."""
+"""Number of rays on which all changes are tried, and number of changes, the best on these, that are
+then tried on all rays."""
 
 
 def fit_parts(
@@ -93,7 +93,7 @@ def _one_more(
 
 
 def _changes(guess: Guess, hull: Bool[np.ndarray, "x y z"], curved: bool) -> Iterator[Change]:
-    """Changes to try: another kind of a part; a part mirrored with its own or a quarter of its
+    """Changes to try: a different kind for a part; a part mirrored with its own or a quarter of its
     width; a part split in two, each fitted to the hull; a part extended to the floor; legs or
     panels below a part; a new part around an uncovered piece of the hull."""
     new = len(guess.kinds)

@@ -9,14 +9,14 @@
 
 A ray is a hit if its pixel belongs to the object, else a miss; it is explained if it meets a part
 exactly when it is a hit. Rays are cut to the object's outline, as the parts are. Vertical rays
-within the outline are added as hits: cameras rarely look down, so that without them nothing would
-make a table top reach the outline.
+within the outline are added as hits: cameras rarely look down, so otherwise no ray would make a
+table top reach the outline.
 
-The price of parts prevents the loss from modelling the volume that a visual hull adds where no view
-sees past the object: a headboard and a mattress cost less than a dome. A part and its mirror images
-count once, and so does a plane and its mirror image; the sides of the box are free, so that edges
-line up. The other prices decide what the rays leave open: unobserved volume is filled, and objects
-are connected, and stand without tipping over or hang.
+Without the price of parts, they would model the unobserved volume that a visual hull adds: a
+headboard and a mattress cost less than a dome. A part and its mirror images count once, and so do a
+plane and its mirror image; the sides of the box are free, so that edges line up. The other terms
+decide where rays give no evidence: unobserved volume is filled, objects are connected, and they
+hang, or stand without tipping over.
 """
 
 from collections.abc import Iterable
@@ -90,7 +90,7 @@ class RayFit:
         down = np.broadcast_to([0.0, -LEVELS, 0.0], above.shape)
         self.starts = np.concatenate([starts[useful], above])
         spans = np.concatenate([spans[useful], down])
-        self.spans = np.where(np.abs(spans) < 1e-6, 1e-6, spans)  # they are divided by
+        self.spans = np.where(np.abs(spans) < 1e-6, 1e-6, spans)  # used as divisors
         self.inverse = 1 / self.spans
         self.hits = np.concatenate([hits, np.ones(len(above), bool)])
         self.outline, self.hangs = outline, hangs

@@ -12,7 +12,7 @@ from numba import njit
 from sceneprior.core.parts import ACROSS_X, ACROSS_Z, BOX, CYLINDER
 
 LEVELS = 64
-"""Intervals between the levels on which faces lie."""
+"""Number of intervals between the levels on which faces lie."""
 
 
 # no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.

@@ -16,7 +16,7 @@ from sceneprior.lifted.lifting.part_prices import LEVELS, planes_of, volume_of
 FAR = 1e6
 """A level beyond all rays."""
 NEVER = 1 << 20
-"""Threshold of a ray that meets the box at no level of the face."""
+"""Threshold of rays that miss the box at every level of the face."""
 
 
 # no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.

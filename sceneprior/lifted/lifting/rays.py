@@ -13,8 +13,7 @@ from sceneprior.lifted.lifting.lifted import LiftedBoxes, RayPool
 from sceneprior.render.silhouettes.cpu.threads import in_threads
 
 NEAR_OUTLINE_PX = 4
-"""Distance in pixels from a mask's outline within which pixels, taken together, are sampled as
-often as all others together."""
+"""Half the width in pixels of the band around a mask's outline from which half of the rays come."""
 FAR_M = 100.0
 """Length of rays that no object stops."""
 
@@ -29,9 +28,9 @@ def draw_rays(
 ) -> RayPool:
     """`count` rays per object, through pixels in and around its mask in every view that shows it.
 
-    A pixel of another object shows that the ray is empty up to that object's box, beyond which it
-    may hide this one. If that box is unknown, or the pixel is void, the ray carries no information.
-    Walls, floor and everything without an id count as background.
+    A pixel of another object shows that the ray is empty up to that object's box; beyond it, this
+    object may be hidden. If the other box is unknown, or the pixel is void, the ray carries no
+    information. Walls, floor and everything without an id count as background.
 
     `margin` is the extent of an object's frame, relative to its box; the other arguments are those
     of `lift_boxes` and its result.
@@ -72,7 +71,7 @@ def _draw(
     cameras_m = -(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0]
     origins_m = cameras_m[view].astype(np.float64)
     until_m = np.where((ids == 0) | (ids == item + 1), FAR_M, 0.0)
-    # By id: True for other objects with a known box. The first id is background, the last void.
+    # Indexed by id: True for other objects with a known box. Id 0 is background, the last id void.
     has_box = np.concatenate([[False], boxes.explained > 0, [False]])
     has_box[item + 1] = False
     other = has_box[ids]

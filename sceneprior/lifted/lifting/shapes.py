@@ -8,10 +8,10 @@ from sceneprior.lifted.lifting.hulls import carve, sightings_of
 from sceneprior.lifted.lifting.lifted import LiftedBoxes, ShapeGrid
 
 REACH = 0.4
-"""`reach` of `hulls.carve`: parts this thin, in cells, are kept."""
+"""`reach` of `hulls.carve`, in cells: parts of this thickness are kept."""
 EMPTY = 0.05
-"""Share of views seeing past a cell above which it is empty. It is lower than the limit in
-`boxes.py`, where one wrong cell can move a whole side of a box; here it is only one cell."""
+"""Share of views that see past a cell above which the cell counts as empty. The limit in `boxes.py`
+is higher, because there one wrong cell can move a whole side of a box."""
 
 
 def lift_shapes(

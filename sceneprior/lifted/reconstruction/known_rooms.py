@@ -31,8 +31,8 @@ from sceneprior.render.offscreen import Pinhole, Renderer
 from sceneprior.render.topdown import scene_meshes
 
 BOX_WEIGHT, OCCLUSION_SLACK = 5.0, 0.15
-"""Weights of the cost by which a room's objects are matched to masks (`match_objects`). The
-occlusion slack is below 1 since boxes of whole objects extend behind their occluders."""
+"""Weight and occlusion slack of the cost by which a room's objects are matched to masks
+(`match_objects`). The slack is below 1 since boxes of whole objects extend behind occluders."""
 SHORTLIST = 16
 """Number of rooms, the best by class and 2D box, whose masks are compared."""
 MASK_COLUMNS = 80
@@ -160,8 +160,8 @@ def _others(rooms: KnownRooms, image: ObservedImage) -> Tensor:
 def _matched(
     known: KnownRooms, rows: Int[Tensor, " rooms"], image: ObservedImage
 ) -> tuple[list[list[int]], Float[Tensor, " rooms"]]:
-    """For each room, the index of the object that it assigns to each mask (an index beyond its last
-    object means none), and the mean cost of the assignment."""
+    """For each room, the index of the object assigned to each mask (an index beyond the last object
+    means none), and the mean cost of the assignment."""
     view = rows_of(as_views([image], 1), torch.zeros(len(rows), dtype=torch.int64))
     # As many padding objects as there are masks, so that every mask gets an index.
     masks = view.is_object.shape[1]

@@ -1,8 +1,8 @@
 """Reconstruct an image object by object: the prior's objects, placed so that they match the masks.
 
 For each mask, candidates are the objects of its class in all training rooms, as the prior decodes
-them, in all quarter turns. Each is moved until its outline fits the mask's. The remaining misfit
-gives its likelihood; the answer is the candidate whose box has the highest expected IoU.
+them, in all quarter turns. Each is moved until its outline fits the mask's. The remaining
+difference gives its likelihood; the answer is the candidate whose box has the highest expected IoU.
 """
 
 from collections.abc import Sequence
@@ -161,7 +161,7 @@ def _placed(candidates: Candidates, guesses: Guesses, masks: Outlines) -> Placed
 def likeliest_box(
     placed: Placed, sizes_m: Float[Tensor, "guesses 3"], rows: Int[Tensor, " guesses"]
 ) -> int:
-    """Index into `rows` of the guess whose box has the highest expected IoU with the true one."""
+    """Index into `rows` of the guess whose box has the highest expected IoU with the true box."""
     likely = (-placed.energy[rows]).double().softmax(dim=0).numpy()
     centers_m, sizes = (part.double().numpy() for part in (placed.centers_m[rows], sizes_m))
     return int((box_iou_3d(centers_m, sizes, centers_m, sizes) @ likely).argmax())

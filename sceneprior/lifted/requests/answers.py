@@ -1,4 +1,4 @@
-"""Requested rooms as scenes; each lists the wishes, and whether they hold."""
+"""Samples requested rooms as scenes, each with the list of wishes and whether they hold."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -37,7 +37,7 @@ def sample_requested(
         name: Prefix of the rooms' names; None names the rooms by the seed.
 
     Raises:
-        InputError: the run has no sampler, or no room holds the request.
+        InputError: the run has no sampler, or no room meets the request.
     """
     check_seed(seed)
     with_sampler = drawn_by_sampler(trained, distribution)
@@ -67,7 +67,7 @@ def sample_requested(
 
 
 def _told(value: Any) -> Any:
-    """A part of a request as plain data for a file: corners, openings and wishes as they came."""
+    """Convert part of a request to plain JSON data: corners, openings and wishes as given."""
     if isinstance(value, Opening):
         return _told(value._asdict())
     if isinstance(value, Mapping):

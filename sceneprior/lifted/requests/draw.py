@@ -25,8 +25,8 @@ from sceneprior.lifted.sampler.plan import Plan
 ATTEMPTS = 8
 """Maximum number of attempts at a room."""
 REQUIRED_FIRST = 4
-"""Number of the attempt, from 0, from which required objects come first, and other objects are left
-out if they find no place."""
+"""Index of the attempt (from 0) from which required objects are placed first, and other objects
+without a place are left out."""
 BATCH = 32
 """Rooms drawn at a time."""
 
@@ -48,11 +48,11 @@ def draw_requested(
 ) -> list[Answer]:
     """Sample rooms that meet a request.
 
-    The parts of a room's floor and contents that the request leaves open are drawn first. Then the
-    objects are placed in `PARTICLES` copies of the room at once: in each step, every copy draws a
-    place for the next object from the sampler, among those that the request allows, and copies
-    without such a place are replaced by others. An attempt fails if no copy is left; there are at
-    most `ATTEMPTS`. The last attempt leaves out required objects without a place, too.
+    The parts of a room's floor and contents that the request leaves open are sampled first. Then
+    the objects are placed in `PARTICLES` copies of the room at once: in each step, every copy
+    samples a place for the next object among those that the request allows, and copies without such
+    a place are replaced by others. An attempt fails if no copy is left; there are at most
+    `ATTEMPTS`. The last attempt also leaves out required objects without a place.
 
     A seed always draws the same rooms, and the first ones do not depend on `count`.
 
@@ -150,7 +150,7 @@ def _furnish(
 
 
 def _answer(particles: Particles, room: int, missing: list[int]) -> Answer:
-    """The first particle of a room; all particles left meet the request."""
+    """The first particle of a room; all remaining particles meet the request."""
     row = room * PARTICLES
     drawn = particles.rooms.changed(lambda part: part[row : row + 1].clone())
     return Answer(particles.plans[room], drawn, tuple(missing))

@@ -1,4 +1,4 @@
-"""Doors and windows of requests: their places, and the space before them that must stay free."""
+"""Doors and windows of requests: their places, and the space in front that must stay free."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -21,7 +21,7 @@ WINDOW_M = (1.2, 0.9, 2.1)
 MARGIN_M = 0.1
 """Distance of drawn doors and windows from the ends of their wall and from each other."""
 BEFORE_WINDOW_M = 0.4
-"""Depth of the floor before a window on which objects must not be higher than the sill."""
+"""Depth of the floor in front of a window where objects must not be higher than the sill."""
 MOST_OPENINGS = 50
 PLACES = 50
 """Maximum number of places drawn for a door or a window."""
@@ -34,25 +34,25 @@ Openings = str | Sequence[Any]
 
 @dataclass(frozen=True)
 class WantedOpening:
-    """A requested door or window; the unspecified part of its place is drawn."""
+    """A requested door or window; the unspecified part of its position is sampled."""
 
     kind: Literal["door", "window"]
     wall: str | int | None = None
-    """A name of `COMPASS`, the number of a side of the floor, or None for any."""
+    """A name of `COMPASS`, the number of a side of the floor, or None for any side."""
     at_m: float | None = None
-    """Distance of the middle from the wall's first end, which is the western or northern one for a
+    """Distance of the middle from the wall's first end, which is the western or northern end for a
     wall of `COMPASS`."""
 
 
 def read_openings(openings: Openings) -> tuple[Opening | WantedOpening, ...]:
-    """Doors and windows from text or a list.
+    """Read doors and windows from a string or a list.
 
-    A text has entries `door`, `door@north`, `door@2` (the side from corner 2 of the floor) or
+    A string has entries `door`, `door@north`, `door@2` (the side from corner 2 of the floor) or
     `window@south:1.5` (its middle 1.5 m from the wall's western or northern end), separated by
     commas. A list may have such entries, `Opening`s, or mappings with the keys of a scene's JSON.
 
     Raises:
-        InputError: an entry has another form.
+        InputError: an entry is malformed.
     """
     entries = openings.split(",") if isinstance(openings, str) else list(openings)
     if len(entries) > MOST_OPENINGS:
@@ -93,7 +93,7 @@ def _read_opening(entry: Any) -> Opening | WantedOpening:
 def moved(
     openings: Sequence[Opening | WantedOpening], by_m: Float[np.ndarray, "2"]
 ) -> tuple[Opening | WantedOpening, ...]:
-    """Openings after their floor is moved by (x, z)."""
+    """Move openings with their floor, by (x, z)."""
     return tuple(
         each._replace(
             start_m=(each.start_m[0] + by_m[0], each.start_m[1] + by_m[1]),
@@ -110,7 +110,7 @@ def place_openings(
     wanted: Sequence[Opening | WantedOpening],
     draws: np.random.Generator,
 ) -> tuple[Opening, ...]:
-    """Doors and windows of one room. Places that are not given are drawn uniformly along the walls.
+    """Doors and windows of one room. Unspecified positions are sampled uniformly along the walls.
 
     Raises:
         InputError: an opening lies on no side of the floor, or there is no free wall for it.
@@ -186,7 +186,7 @@ def _pair(point: Float[np.ndarray, "2"]) -> tuple[float, float]:
 
 
 class Zone(NamedTuple):
-    """Space before an opening that must stay free: a polygon (x, z) and a range of heights."""
+    """Space in front of an opening that must stay free: a polygon (x, z) and a range of heights."""
 
     polygon: shapely.Polygon
     from_m: float
@@ -194,14 +194,14 @@ class Zone(NamedTuple):
 
 
 def zones_of(shape: RoomShape) -> dict[str, list[Zone]]:
-    """The spaces that must stay free, by kind of opening: before a door, the volume through which
-    it swings, as deep as the door is wide; before a window, the space above the sill."""
+    """The spaces that must stay free, by kind of opening: in front of a door, the volume through
+    which it swings, as deep as the door is wide; in front of a window, the space above the sill."""
     zones: dict[str, list[Zone]] = {"door": [], "window": []}
     for each in shape.openings:
         start, end = np.array(each.start_m), np.array(each.end_m)
         depth = np.linalg.norm(end - start) if each.kind == "door" else BEFORE_WINDOW_M
         into = depth * inward_of(shape, each)
-        # 1 cm less on all sides, so that furniture may touch the zone.
+        # 1 cm smaller on all sides, so that furniture may touch the zone.
         polygon = shapely.Polygon([start, end, end + into, start + into]).buffer(-0.01)
         low_m = 0.0 if each.kind == "door" else each.bottom_m
         zones[each.kind].append(Zone(polygon, low_m, each.top_m))
@@ -209,7 +209,7 @@ def zones_of(shape: RoomShape) -> dict[str, list[Zone]]:
 
 
 def inward_of(shape: RoomShape, opening: Opening) -> Float[np.ndarray, "2"]:
-    """Unit normal, into the room, of the wall that has a door or window."""
+    """Unit normal, into the room, of the wall with this door or window."""
     middle = shapely.Point(np.mean([opening.start_m, opening.end_m], axis=0))
     sides = sides_of(shape.outline_m)
     lines = [shapely.LineString([side.start_m, side.end_m]) for side in sides]

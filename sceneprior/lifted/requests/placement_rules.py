@@ -15,12 +15,12 @@ from sceneprior.lifted.requests.shape import RoomShape
 from sceneprior.lifted.requests.wishes import RelationWish
 
 FLUSH_M = 0.15
-"""Largest gap between the back of an object and a side of its rectangle in the floor for which the
-back counts as standing at this side."""
+"""Maximum gap between an object's back and a side of its rectangle in the floor at which the object
+counts as standing with its back to this side."""
 WALL_M = 0.3
-"""Largest distance of the middle of such a back from a wall."""
+"""Maximum distance of the middle of such a back from a wall."""
 BEFORE_WINDOWS = ("lamp", "plant")
-"""Words in the names of classes that may stand or hang before a window."""
+"""Words in the names of classes that may stand or hang in front of a window."""
 
 
 class PlacementRules:
@@ -57,7 +57,7 @@ class PlacementRules:
         rectangles_m: Float[np.ndarray, "candidates 4"],
         enough: int,
     ) -> tuple[Bool[np.ndarray, " candidates"], str]:
-        """True for places that an object of a class may take, and the first reason for a rejection.
+        """True for places that an object of class `label` may take, and a reason for rejections.
 
         Args:
             candidates: Places of the object.
@@ -104,7 +104,7 @@ class PlacementRules:
     def _leaves_free(
         self, kind: str, label: int, candidates: Furniture
     ) -> Bool[np.ndarray, " candidates"]:
-        """True for places that leave the space before doors or windows free."""
+        """True for places that do not block the space in front of doors or windows."""
         free = np.ones(len(candidates.back), dtype=bool)
         may = any(word in self.classes[label] for word in BEFORE_WINDOWS)
         if not self._zones[kind] or (kind == "window" and may):
@@ -121,8 +121,8 @@ class PlacementRules:
 def backed_by_walls(
     shape: RoomShape, candidates: Furniture, rectangles_m: Float[np.ndarray, "candidates 4"]
 ) -> Bool[np.ndarray, " candidates"]:
-    """False for places whose back is at a side of their rectangle in the floor, but not at a wall:
-    inner sides of rectangles in an L-shaped floor are not walls."""
+    """False for places whose back is at a side of their rectangle but not at a wall: in an L-shaped
+    floor, some sides of rectangles are not walls."""
     if shape.is_rectangle:
         return np.ones(len(candidates.back), dtype=bool)
     inward = -OUTWARD[candidates.back]

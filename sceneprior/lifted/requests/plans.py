@@ -14,8 +14,8 @@ from sceneprior.lifted.requests.shape import RoomShape
 from sceneprior.lifted.sampler.network import RoomSampler
 
 RECTANGLES = 16
-"""Number of rectangles drawn for a room without a requested floor. The first that is large enough
-for the required objects is taken, or else the largest."""
+"""Number of rectangles sampled for a room without a requested floor. The first rectangle that is
+large enough for the required objects is taken, or else the largest."""
 FULL_SHARE = 0.5
 """Largest share of a drawn floor that the mean footprints of given and required objects cover."""
 CROWDED_SHARE = 1.2
@@ -73,7 +73,7 @@ def _drawn_outline(
     areas_m2 = rectangles_m[:, 2:].prod(axis=1)
     enough = areas_m2 >= needed_m2
     half = rectangles_m[int(enough.argmax() if enough.any() else areas_m2.argmax()), 2:] / 2
-    if request.objects:  # no wall may cross them
+    if request.objects:  # the floor must contain them
         boxes_m = np.array([[*item.center_m, *item.size_m] for item in request.objects])
         reach = (np.abs(boxes_m[:, [0, 2]]) + boxes_m[:, [3, 5]] / 2).max(axis=0)
         half = np.maximum(half, reach)
@@ -81,7 +81,7 @@ def _drawn_outline(
 
 
 def check_area(sampler: RoomSampler, request: Request, classes: tuple[str, ...]) -> None:
-    """Refuse wishes that need more floor than the request has.
+    """Reject requests whose objects need more floor than the request has.
 
     Raises:
         InputError: the required objects at their smallest cover `CROWDED_SHARE` of the floor.

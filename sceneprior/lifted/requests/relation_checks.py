@@ -53,7 +53,7 @@ def furniture_of(
     object_class: Int[Tensor, " objects"],
     looks: Int[Tensor, " objects"],
 ) -> Furniture:
-    """Objects with the sides at which their looks have the back and the front."""
+    """Objects, with the sides of their backs and fronts, which follow from their looks."""
     back, front = (side_of(looks, sides).numpy() for sides in (sampler.backs, sampler.fronts))
     return Furniture(boxes_m.double().numpy(), object_class.numpy(), back, front)
 

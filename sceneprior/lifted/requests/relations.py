@@ -1,6 +1,6 @@
 """Relations that can be requested: a closed list, on axis-aligned boxes with a front.
 
-InstructScene (Lin and Mu, ICLR 2024; its `compute_loc_rel`) knows left, right, front and behind as
+InstructScene (Lin and Mu, ICLR 2024; its `compute_loc_rel`) has left, right, front and behind as
 sectors of 90 degrees between centres on the floor, up to 3 m, "closely" below 1 m, and above and
 below for an object whose footprint contains the other's centre. InstructScene's sectors follow the
 world's axes; here they follow the front of an object, since "in front of the bed" depends on the
@@ -15,7 +15,8 @@ across it |
 | at a wall | the footprint is at most `AT_WALL_M` from a side of the floor |
 | in a corner | the footprint is at most `CORNER_M` from a convex corner of the floor |
 | under | one centre lies in the other's footprint, and the object's top is below the target's \
-bottom or the target is a lamp; under a window: at most `REACH_M` before it, and below its sill |
+bottom or the target is a lamp; under a window: at most `REACH_M` in front of it, and below \
+its sill |
 | near | the footprints are less than `NEAR_M` apart |
 | far from | the centres are more than `FAR_M` apart, beyond which InstructScene has no relation |
 """
@@ -42,13 +43,13 @@ NEAR_M = 1.0
 """InstructScene's threshold of "closely", applied to footprints in place of centres: the centres of
 a double bed and of a nightstand that touches it are 1.3 m apart."""
 FAR_M = 3.0
-"""InstructScene's largest distance of a relation, between centres."""
+"""InstructScene's maximum distance between the centres of related objects."""
 AT_WALL_M = 0.2
 CORNER_M = 0.4
 SECTOR_RAD = np.pi / 4
 """Half the angle of a sector."""
 REACH_M = 0.5
-"""Largest distance from a window for `under`."""
+"""Maximum distance in front of a window at which an object may be `under` the window."""
 OUTWARD = np.array([(0.0, -1.0), (-1.0, 0.0), (0.0, 1.0), (1.0, 0.0)])
 """Direction (x, z) towards the sides low z, low x, high z and high x (`side_of`)."""
 

@@ -89,7 +89,7 @@ def make_request(
     for item in objects:
         check_box("The request", item.label, item.center_m, item.size_m)
     targets = {wish.target for wish in wishes.relations}
-    for kind in OPENINGS:  # a relation to a door or a window needs one
+    for kind in OPENINGS:  # a relation to a door or a window needs such an opening
         if kind in targets and all(each.kind != kind for each in placed):
             placed += read_openings(kind)
     outline_m = None if floor is None else read_floor(floor)

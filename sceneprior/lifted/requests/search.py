@@ -1,5 +1,5 @@
-"""Search for the place of a required object when the sampler draws none that fits: candidates from
-the whole room are weighted by the sampler's density."""
+"""Search for a place for a required object when no place that the sampler draws is allowed:
+candidates from the whole room are weighted by the sampler's density."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -45,8 +45,8 @@ def search(
     upcoming: Sequence[int],
     draws: np.random.Generator,
 ) -> tuple[int, Float[Tensor, "6"]] | str:
-    """The look, in one of four rotations, and the box of an allowed place; or the reason why there
-    is none.
+    """Find an allowed place: return the look, in one of four rotations, and the box, or the reason
+    why no place was found.
 
     Importance sampling: one of at most `COMPARED` allowed places is drawn in proportion to the
     sampler's density.

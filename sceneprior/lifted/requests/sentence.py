@@ -33,7 +33,7 @@ _SIZE = re.compile(
 )
 _LENGTH = re.compile(r"\d+\.?\d*\s*(?:mm|cm|m|metres?|meters?|centimetres?|centimeters?)\b")
 _SIZE_TOKEN = "#"
-"""Stands for the size of the floor, so that it is not taken for that of a piece of furniture."""
+"""Token for the size of the floor, so that it is not mistaken for the size of furniture."""
 _TOKEN = re.compile(r"[a-z_']+|\d+(?:\.\d+)?|\S")
 
 
@@ -85,7 +85,7 @@ def read_sentence(text: str, known: Sequence[str], label_set: str) -> Sentence:
     reader = _Reader(tokens, known, label_set)
     reader.read()
     if reader.strange:
-        # A relation is only listed if nothing else is: mostly its target is the unknown word.
+        # Relation words are left out if another word is unknown: usually it is their target.
         fine = {*ARTICLES, *RELATION_WORDS}
         listed = [word for word in reader.strange if word not in fine] or reader.strange
         words = ", ".join(f"'{word[:40]}'" for word in dict.fromkeys(listed))
@@ -107,7 +107,7 @@ def _other_length(length: str) -> InputError:
 
 
 class _Reader:
-    """Reads tokens from left to right; `strange` collects those that it does not know."""
+    """Reads tokens from left to right; `strange` collects unknown tokens."""
 
     def __init__(self, tokens: list[str], known: Sequence[str], label_set: str):
         self.tokens, self.at = tokens, 0

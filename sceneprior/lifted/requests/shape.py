@@ -21,12 +21,12 @@ SPACING_M = 0.25
 NEW_SHARE = 0.01
 """Share of the floor that a rectangle must cover beyond the larger ones to be kept."""
 MOST_CELLS = 130**2
-"""Largest number of cells between the coordinates at which rectangles may end; the search needs
-the square of it in bytes."""
+"""Largest number of cells between the coordinates at which rectangles may end; the memory of the
+search in bytes is the square of this number."""
 LEAST_AREA_M2 = 1.0
 """Smallest floor that can be requested."""
 LONGEST_M = 60.0
-"""Largest extent of a floor that can be requested; larger ones are in another unit."""
+"""Largest extent of a floor that can be requested; larger numbers are probably not in metres."""
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)")
 _SIZE = re.compile(r"\s*(\d+\.?\d*|\.\d+)\s*(?:m\s*)?[xX×]\s*(\d+\.?\d*|\.\d+)\s*m?\s*")
 
@@ -158,7 +158,7 @@ def read_floor(floor: str | Sequence[Any] | np.ndarray) -> np.ndarray:
 
 
 def _floor_of_text(text: str) -> np.ndarray:
-    """Corners that a text names by the floor's size, or one by one."""
+    """Parse a floor given as text: its size, or its corners."""
     if (found := _SIZE.fullmatch(text)) is not None:
         half = np.array([float(side) / 2 for side in found.groups()])
         return rectangle(-half, half)
@@ -194,7 +194,7 @@ def inner_rectangles(polygon: shapely.Polygon) -> Float[np.ndarray, "rectangles 
         covered[x1[:, None], z1] - covered[x0[:, None], z1]
         - covered[x1[:, None], z0] + covered[x0[:, None], z0]
     )  # fmt: skip
-    full = np.zeros((len(x) + 2,) * 2 + (len(z) + 2,) * 2, dtype=bool)  # from x, to x, z and z
+    full = np.zeros((len(x) + 2,) * 2 + (len(z) + 2,) * 2, dtype=bool)  # from x, to x, from z, to z
     cells_within = (x1 - x0)[:, None] * (z1 - z0)
     full[x0[:, None] + 1, x1[:, None] + 1, z0 + 1, z1 + 1] = inside == cells_within
     inner = full[1:-1, 1:-1, 1:-1, 1:-1]

@@ -1,4 +1,4 @@
-"""One step of sequential Monte Carlo: the next object of each particle is placed where the request
+"""One step of sequential Monte Carlo: place the next object of each particle where the request
 allows it."""
 
 from collections import Counter
@@ -27,8 +27,8 @@ SIZE_RANGE = 0.35
 than without a request: in a small room, the particles with the smallest objects survive."""
 LOW_M = 0.15
 ON_FLOOR = 0.75
-"""Probability of a bottom below `LOW_M` above which an object is set on the floor: in a small room,
-a particle with a bed in mid-air would survive."""
+"""An object is set on the floor if the probability that its bottom is below `LOW_M` exceeds this
+value. Otherwise, in a small room, particles with a bed in mid-air would survive."""
 
 Rejections = Counter[tuple[int, str]]
 """Number of places rejected for an object, by its class and the reason."""
@@ -57,7 +57,7 @@ def place_next(
     hanging: Sequence[int],
     rejections: Rejections,
 ) -> None:
-    """Place the next object in all living particles; particles without a place for it die.
+    """Place the next object in all living particles; particles without a place die.
 
     Args:
         rules, draws: Placement rules and random numbers of each room.

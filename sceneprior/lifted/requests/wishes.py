@@ -36,8 +36,8 @@ class CountWish:
 
 @dataclass(frozen=True)
 class RelationWish:
-    """A relation that at least `count` objects of a class have to the room, to some object of the
-    target's class, or to some door or window."""
+    """Wish that at least `count` objects of a class have a relation to the room, to an object of
+    the target's class, or to a door or window."""
 
     subject: str
     relation: str
@@ -58,8 +58,8 @@ class Wishes:
     relations: tuple[RelationWish, ...] = ()
 
     def bounds(self, label: str) -> tuple[int, int | None]:
-        """Least and largest number of objects of a class that fulfil all wishes. Relations need
-        their subjects and targets, too."""
+        """Smallest and largest number of objects of a class that meet all wishes; subjects and
+        targets of relations are required, too."""
         own = [wish for wish in self.counts if wish.label == label]
         least = max([0, *(wish.least for wish in own), *self._needed(label)])
         most = min((wish.most for wish in own if wish.most is not None), default=None)
@@ -92,7 +92,7 @@ def count_wish(label: str, value: Any) -> CountWish:
     ('at least 1 wardrobe', '2 nightstand')
 
     Raises:
-        InputError: `value` is no such number.
+        InputError: `value` has another form.
     """
     found = None
     if isinstance(value, str):
@@ -155,7 +155,7 @@ def relation_wish(entry: Mapping[str, Any]) -> RelationWish:
 
 
 def check_wishes(wishes: Wishes, known: Sequence[str], given: Mapping[str, int], most: int) -> None:
-    """Refuse wishes that no room of a prior can meet.
+    """Reject wishes that no room of a prior can meet.
 
     Args:
         known: Classes that the prior draws.

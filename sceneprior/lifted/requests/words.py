@@ -19,7 +19,7 @@ NOUNS: dict[str, tuple[str, ...]] = {
     "lamp": ("ceiling_lamp", "pendant_lamp", "lamp"), "fridge": ("refridgerator",),
     "refrigerator": ("refridgerator",), "tv": ("television",), "tub": ("bathtub",),
 }  # fmt: skip
-"""Classes that a noun may mean. The first class that the prior draws is taken."""
+"""Classes that a noun may mean; the first class that the prior draws is used."""
 RELATION_WORDS = {
     "beside": "beside", "next to": "beside", "at the side of": "beside", "alongside": "beside",
     "in front of": "in front of", "before": "in front of", "facing": "facing",

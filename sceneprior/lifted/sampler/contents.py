@@ -8,10 +8,10 @@ from torch.nn import functional as F
 from sceneprior.core.mixtures import draw_index
 
 END = 0
-"""Class that ends a room's list: void, which no object of the list has."""
+"""Class that ends a room's list: void, which no listed object has."""
 MANY = 3
-"""Counts of a class are also encoded by this many bits, "at least 1", "at least 2" and so on: the
-first object of a class is more informative than the next ones."""
+"""Number of bits ("at least 1", "at least 2" and so on) that encode the count of a class, besides
+the count itself: the first object of a class is more informative than the next ones."""
 
 
 class Contents(nn.Module):
@@ -78,7 +78,7 @@ class Contents(nn.Module):
         extents_m: Float[Tensor, "rooms 2"],
         uniform: Float[Tensor, "rooms slots"],
     ) -> Int[Tensor, "rooms slots"]:
-        """Sample classes to add to the `counts` already there, at most `free` of them, followed by
+        """Sample the classes to add to the given `counts`, at most `free` of them, followed by
         `END`."""
         going, drawn = torch.ones_like(free, dtype=torch.bool), torch.zeros_like(uniform).long()
         for slot, chance in enumerate(uniform.unbind(dim=1)):

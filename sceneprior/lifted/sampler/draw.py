@@ -49,7 +49,7 @@ BATCH = 256
 def draw_rooms(
     sampler: RoomSampler, count: int, seed: int, given: Given | None = None
 ) -> RoomBoxes:
-    """New rooms with looks and rectangles; given objects come first, with their own boxes.
+    """Sample new rooms with looks and rectangles; given objects come first, with their own boxes.
 
     A room's contents are sampled first (`plan_rooms`), then its objects one by one, each at the
     first of `TRIES` sampled places where it neither intersects an object that it should not
@@ -102,7 +102,7 @@ def _draw(
     last: bool,
     keep: bool,
 ) -> tuple[RoomBoxes, Bool[Tensor, " rooms"]]:
-    """Furnish rooms once; also returns a mask of the rooms to furnish again, because some object
+    """Furnish rooms once; also return a mask of the rooms to furnish again, because some object
     found no place, or a side of a sampled rectangle stays empty.
 
     With `keep`, the last attempt places objects in any case.
@@ -165,7 +165,7 @@ def _placed(
     look = draw_index(sampler.look_logits(reading, label), chance[:, 1])
     size_m = sampler.draw_size(look, chance[:, 2])
     bottoms = sampler.bottom(reading, label, look, size_m)
-    bottom_m = bottoms.draw(chance[:, 3], chance[:, 4:5])[:, 0].clamp(min=0)  # the floor
+    bottom_m = bottoms.draw(chance[:, 3], chance[:, 4:5])[:, 0].clamp(min=0)  # not below the floor
     places = sampler.place(reading, label, look, size_m, bottom_m)
     numbers = chance[:, 5:].unflatten(1, (PLACES, 4))[:, :tries]
     x = places.draw_x(numbers[..., :2])

@@ -1,4 +1,4 @@
-"""The frame of an object: its room, turned so that the object's back is at low z.
+"""The frame of an object: its room, rotated so that the object's back is at low z.
 
 The back of a prototype is its side that is nearest to a side of the room's rectangle on average. In
 its own frame, a bed stands at the same place whichever of the four walls it stands against, so all
@@ -23,7 +23,7 @@ FURTHEST_M = 1.0
 def side_of(
     looks: Int[Tensor, "*batch"], sides: Int[Tensor, " prototypes"]
 ) -> Int[Tensor, "*batch"]:
-    """The side of the room at which each look has one side of its prototype, such as its back.
+    """Side of the room towards which one side of each look's prototype points, such as its back.
 
     Args:
         sides: This side of each prototype in pose 0.

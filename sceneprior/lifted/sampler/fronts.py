@@ -1,6 +1,6 @@
-"""Which way furniture faces, as far as masks tell: a side of each prototype, with a confidence.
+"""Estimates which side of each prototype is its front, from masks alone, with a confidence.
 
-Nothing in the masks names the front of a piece of furniture. Four cues point to its back: it stands
+Masks do not show the front of a piece of furniture directly. Four cues point to its back: it stands
 near a wall, nothing stands close behind it, it is higher than the other sides (the back of a chair,
 the headboard of a bed), and it is one of the two wide sides. The front is opposite to the back.
 """
@@ -25,13 +25,13 @@ BESIDE = 0.3
 """Share of the smaller of two footprints' extents that must overlap, along one axis, for one object
 to stand in front of, behind or beside the other."""
 STRIP = 0.2
-"""Part of a prototype's extent whose height counts as that of its side."""
+"""Depth of the strip, as a share of a prototype's extent, whose height is that of a side."""
 
 
 def find_fronts(
     rooms: RoomBoxes, prototypes: Prototypes, count: int
 ) -> tuple[Int[Tensor, " count"], Float[Tensor, " count"]]:
-    """The side to which each prototype's front points in pose 0, and the confidence of that.
+    """The side to which each prototype's front points in pose 0, with a confidence.
 
     Args:
         rooms: Furnished rooms with looks.
@@ -39,8 +39,8 @@ def find_fronts(
         count: Length of the result, at least the number of prototypes; the rest is 0.
 
     Returns:
-        Sides 0 to 3 for low z, low x, high z and high x; probabilities, a quarter at least for
-        prototypes that occur, which are right as often as they say on the rooms of `WEIGHTS`.
+        Sides 0 to 3 for low z, low x, high z and high x; probabilities of these, at least 1/4 for
+        prototypes that occur and 0 for others, calibrated on the rooms of `WEIGHTS`.
     """
     assert rooms.looks is not None
     sides = own_sides(rooms.looks)
@@ -86,8 +86,8 @@ def _gaps_to_furniture(rooms: RoomBoxes) -> Float[Tensor, "rooms objects 4"]:
 
 
 def _heights(grids: Bool[np.ndarray, "prototypes x y z"]) -> Float[np.ndarray, "prototypes 4"]:
-    """How high each prototype is along each side, above the mean of its four sides and relative to
-    the grid's height."""
+    """Height of each prototype along each side, relative to the grid's height and minus the mean of
+    the four sides."""
     found = np.zeros((len(grids), QUARTERS))
     for row, grid in enumerate(grids):
         if not grid.any():

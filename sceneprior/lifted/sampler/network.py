@@ -137,7 +137,7 @@ class RoomSampler(nn.Module):
     def tokens(
         self, rooms: RoomBoxes, rectangle_m: Float[Tensor, "rooms 4"]
     ) -> Float[Tensor, "rooms objects width"]:
-        """Encoder inputs, one per object: class, look, size, height, and its place in the rectangle
+        """Encoder inputs, one per object: class, look, size, height, and place in the rectangle
         (centre x, z, extents x, z)."""
         assert rooms.looks is not None
         centre, size = rooms.boxes_m.split(3, dim=-1)

@@ -27,13 +27,14 @@ from sceneprior.lifted.sampler.rooms import gaps_to_sides_m, shared_extents
 SHOWN = PARTS**3 + 3
 """Numbers that encode a look: its coarse grid and the logarithms of its extents."""
 EMBEDDING = 16
-"""Dimension of the embeddings of classes and of looks. All inputs here are small or coarse, because
-exact sizes would identify a training room."""
+"""Dimension of the embeddings of classes and of looks. All inputs of this module are small or
+coarse, because exact sizes would identify a training room."""
 WIDTH = 64
 """Width of the hidden layers."""
 NARROW_M, WIDE_M = 0.03, 0.2
-"""Scales in metres of narrow and wide logistics for a network output of 0. Wide are one of the two
-anchors at each position that the room gives, and the anchors `APART_M` from an object."""
+"""Scales in metres of narrow and wide logistics, for a network output of 0. Wide logistics are used
+at one of the two anchors at each position given by the room, and at anchors `APART_M` from an
+object."""
 SHIFT_M = 0.3
 """Shift of an anchor in metres for a network output of 1."""
 
@@ -45,7 +46,7 @@ class Placement(nn.Module):
     of the rectangle, in the middle of the rectangle, and in the middle of the floor. Every object
     already placed gives anchors adjacent to it, flush with its sides, centred on it, and apart from
     it. So an object can stand flush with a wall along one axis and adjacent to another object along
-    the other. The weight of an anchor depends on what an object there would stand next to
+    the other. The weight of an anchor depends on the neighbours of an object at the anchor
     (`AxisScore`).
 
     Args:

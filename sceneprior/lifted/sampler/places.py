@@ -14,7 +14,7 @@ from sceneprior.core.mixtures import LogisticMixture
 from sceneprior.lifted.sampler.frames import turn_places
 
 BY_SIDES = 8
-"""Number of anchors along an axis that the room gives: a narrow and a wide one at each of four
+"""Number of anchors along an axis given by the room: a narrow and a wide one at each of four
 positions. These are flush with the lower side of the rectangle, flush with its upper side, in its
 middle, and at the origin, which is the middle of the floor."""
 BY_OBJECT = 7
@@ -51,13 +51,13 @@ def ramps(lengths_m: Float[Tensor, "*batch n"], knots_m: tuple[float, ...]) -> T
 
 
 class Anchors(NamedTuple):
-    """Positions along an axis, and features of what an object at each would stand next to."""
+    """Positions along an axis, with features of the neighbours of an object at each position."""
 
     at_m: Float[Tensor, "rooms anchors"]
     exists: Bool[Tensor, "rooms anchors"]
     """False for the anchors of padding."""
     kind: Int[Tensor, " anchors"]
-    """0 to 7 for anchors that the room gives, 8 to 14 for anchors of an object."""
+    """0 to 7 for anchors given by the room, 8 to 14 for anchors of an object."""
     relations: tuple[Float[Tensor, "rooms #anchors objects _"], ...]
     """Features of the relations to the objects, in several tensors. A tensor that is the same for
     all anchors has size 1 along that axis."""

@@ -33,8 +33,7 @@ class Given:
 
 
 class Plan(NamedTuple):
-    """Conditions of rooms before they are furnished: those of `Given`, with everything that was
-    missing sampled."""
+    """Conditions of rooms before they are furnished: those of `Given`, completed by sampling."""
 
     objects: RoomBoxes
     rectangle_m: Float[Tensor, "rooms 4"]

@@ -1,5 +1,4 @@
-"""Inputs of the sampler's network: a room's frame, and partly furnished rooms as its encoder reads
-them."""
+"""Inputs of the sampler's network: a room's frame, and the encoding of partly furnished rooms."""
 
 import math
 from typing import NamedTuple
@@ -13,10 +12,10 @@ from sceneprior.core.views import RoomBoxes
 OCTAVES = 6
 """Frequencies in the encoding of a length."""
 LONGEST_M = 16.0
-"""Longest period of that encoding, which has a sine and a cosine for each of `OCTAVES` periods:
-this one, half of it, a quarter and so on."""
+"""Longest period of that encoding, which has a sine and a cosine for each of `OCTAVES` periods;
+each is half the previous one."""
 LENGTHS = 1 + 2 * OCTAVES
-"""Numbers that encode a length."""
+"""Number of values that encode a length."""
 
 
 class Frame(NamedTuple):

@@ -17,7 +17,7 @@ from sceneprior.lifted.lifting.dataset import LiftedDataset
 from sceneprior.lifted.prototypes import POSES, Prototypes, turned_looks
 
 GRAZE_M = 0.05
-"""Overlap along an axis up to which an intersection of lifted boxes is put down to their
+"""Overlap along an axis up to which an intersection of lifted boxes is attributed to their
 inaccuracy."""
 SYMMETRIES = 2 * QUARTERS
 """Symmetries of a room: mirrored or not, times the quarter turns; 0 is the untransformed room."""
@@ -26,15 +26,15 @@ LOOSELY = 2.0
 FRAME_M = 0.15
 """Standard deviation of the normal distribution in `frames_of`."""
 SURE_M = 0.03
-"""Largest error of a wall that is a side of a training room's rectangle."""
+"""Maximum standard error of a wall that replaces a side of a training room's rectangle."""
 AT_WALL_M = 0.45
-"""Largest gap between furniture and a wall that is a side of the rectangle; drawn rooms with larger
-gaps are drawn again (`draw.py`)."""
+"""Maximum gap between furniture and such a wall; drawn rooms with larger gaps are drawn again
+(`draw.py`)."""
 FACING = 0.98
-"""Smallest cosine between a wall's normal and the axis that its side lies on: 11 degrees."""
+"""Minimum cosine between a wall's normal and that of the rectangle's side: 11 degrees."""
 PLAUSIBLE_SHARE = 0.2
-"""Share of the training rooms with both classes in which the two must intersect for this to be
-considered intended. Lifted boxes of chairs intersect each other in a seventh of the rooms, true
+"""Share of the training rooms with both classes in which the two must intersect for intersections
+to count as intended. Lifted boxes of chairs intersect each other in a seventh of the rooms, true
 boxes in none."""
 
 
@@ -63,7 +63,7 @@ class SamplerRooms:
     def see_looks(self, prototypes: Prototypes) -> "SamplerRooms":
         """Set `rooms`, in which every object has a look, and return this data set.
 
-        Only common prototypes are used, since odd ones are often badly lifted.
+        Only common prototypes are used, since odd prototypes are often badly lifted.
         """
         lifted, prototypes = self._lifted, prototypes.common_alone()
         counts = [len(room.explained) for room in lifted.boxes]
@@ -148,8 +148,8 @@ def rectangles_of(rooms: RoomBoxes) -> Float[Tensor, "rooms 4"]:
 
 
 def _walls_of(walls: Sequence[Wall], rectangle_m: np.ndarray) -> list[float]:
-    """One row of `RoomBoxes.walls_m`: at each side of the rectangle around the furniture, the
-    nearest wall that faces it and is opposite to a part of it."""
+    """One row of `RoomBoxes.walls_m`: for each side of the rectangle around the furniture, the
+    nearest wall that faces this side and overlaps with it along its direction."""
     middle, half = rectangle_m[:2], rectangle_m[2:] / 2
     found = []
     for outwards in np.array([[0, -1], [-1, 0], [0, 1], [1, 0]]):
@@ -172,8 +172,8 @@ def _walls_of(walls: Sequence[Wall], rectangle_m: np.ndarray) -> list[float]:
 
 
 def frames_of(rooms: RoomBoxes, generator: torch.Generator) -> Float[Tensor, "rooms 4"]:
-    """`rectangles_of`, with each side moved outwards: to the wall if it is known, otherwise by the
-    absolute value of a normal number.
+    """`rectangles_of` with each side moved outwards: to the wall if known, otherwise by the
+    absolute value of a normal random number.
 
     The exact extents would reveal when a room is complete, since the last object touches them, and
     sampled furniture never fits a rectangle exactly. So noise of standard deviation `FRAME_M` is
@@ -232,8 +232,8 @@ def turned_rooms(rooms: RoomBoxes, symmetry: Int[Tensor, " rooms"]) -> RoomBoxes
 
 
 def own_sides(looks: Int[Tensor, "*batch"]) -> Int[Tensor, "*batch 4"]:
-    """The side of the room at which each of the four sides of a look's prototype is; sides are 0 to
-    3 for low z, low x, high z, high x."""
+    """Side of the room towards which each of the four sides of a look's prototype points; sides are
+    0 to 3 for low z, low x, high z, high x."""
     pose, own = (looks % POSES).unsqueeze(-1), torch.arange(QUARTERS, device=looks.device)
     # Mirroring (x reversed) comes before the turn, and reverses the direction of sides.
     return (pose % QUARTERS + torch.where(pose >= QUARTERS, -own, own)) % QUARTERS

@@ -2,7 +2,7 @@
 
 Real furniture repeats a limited number of models, and lifted boxes of the same model differ by a
 few per cent. Objects of one prototype with similar extents are one entry, with their median extents
-and their number. An entry is a size alone: it says nothing of the rooms in which it was found.
+and their number. An entry holds only a size, and nothing about the rooms in which it was found.
 """
 
 import numpy as np

@@ -50,7 +50,7 @@ squared."""
 
 
 class SamplerStage(lightning.LightningModule):
-    """Maximum likelihood of rooms, each in a random order of its objects and one of eight
+    """Trains by maximum likelihood of rooms, each in a random order of its objects and one of eight
     symmetries."""
 
     def __init__(
@@ -92,7 +92,7 @@ class SamplerStage(lightning.LightningModule):
         """Every few epochs, keep the network if the val rooms' likelihood is the highest so far.
 
         This runs after the last batch of the epoch, because the epoch's checkpoint is written
-        before Lightning's end of the epoch.
+        before Lightning ends the epoch.
         """
         done = self.current_epoch + 1
         looks = done % self.stage.val_every == 0 or done == self.stage.epochs

@@ -39,8 +39,8 @@ def violation(
 ) -> Float[Tensor, " rooms"]:
     """Violation of a box; 0 if there is none.
 
-    It is the sum of two terms: the shared volumes with objects marked in `apart`, each relative to
-    the smaller box, and the metres by which the box extends beyond the rectangle.
+    The violation is the sum of two terms: the shared volumes with objects marked in `apart`, each
+    relative to the smaller box, and the metres by which the box extends beyond the rectangle.
     """
     others = reading.before
     here, theirs = boxes_m.unsqueeze(1), others.boxes_m

@@ -75,7 +75,7 @@ def assign(
 def side_distance(
     predicted: Tensor, observed: Tensor, clear: Tensor, side: int, occlusion_slack: float
 ) -> Tensor:
-    """Distance between one side of predicted 2D boxes and the same side of observed ones.
+    """Distance between one side of predicted 2D boxes and the same side of observed boxes.
 
     Args:
         predicted, observed: Coordinates of the side, relative to the image size.

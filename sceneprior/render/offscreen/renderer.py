@@ -15,7 +15,7 @@ from sceneprior.render.offscreen.cameras import Camera, Pinhole
 from sceneprior.render.offscreen.sky import sky_light
 
 EVEN = 0.2
-"""Power that brings the brightness of walls near 1: 0.4 becomes 0.83."""
+"""Exponent that brightens walls and evens out their brightness: 0.4 becomes 0.83."""
 
 
 class Renderer(abc.ABC):
@@ -53,11 +53,11 @@ class Renderer(abc.ABC):
     ) -> np.ndarray:
         """Draw a shaded picture, (H, W, 3) uint8, with mesh k in the colour `colors[k]`.
 
-        The light comes from the camera. The first `shadowed` meshes shadow each other softly under
-        light from the sky (`sky.py`), if the camera is a `Pinhole`; the others, walls, are then lit
-        almost evenly. The background is a colour, or a picture of the
-        same size. Both renderers draw this with the software z-buffer, so that pictures look the
-        same everywhere.
+        The light comes from the camera. If the camera is a `Pinhole`, the first `shadowed` meshes
+        also shadow each other softly under light from the sky (`sky.py`). The other meshes, such as
+        walls, are lit almost evenly if `shadowed` is not 0. The background is a colour, or a
+        picture of the same size. Both renderers draw this with the software z-buffer, so that
+        pictures look the same everywhere.
         """
         height, width = image_size
         soup = _join(meshes)

@@ -1,4 +1,4 @@
-"""Light from the sky: how much of it reaches each pixel of a picture, for soft shadows."""
+"""Soft shadows: the share of light from the sky that reaches each pixel of a picture."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -53,8 +53,8 @@ def sky_light(
         pose[:3, :3], pose[:3, 3] = rotation, [0, 0, 2 * reach_m] - rotation @ middle_m
         projection = (scale, scale, MAP_PX / 2, MAP_PX / 2)
         _, nearest = rasterize(vertices_m, faces, pose, projection, (MAP_PX, MAP_PX), False)
-        # Within one pixel of the map, the depth of the floor varies by its slope over the scale; at
-        # least that of a slope of 45 degrees is allowed for, since furniture has other sides.
+        # Within one pixel of the map, the depth of the floor varies by its slope over the scale. A
+        # slope of at least 45 degrees is assumed, since other surfaces are steeper than the floor.
         slope = max(1.0, np.hypot(towards[0], towards[2]) / towards[1])
         _count_unoccluded(points_m, pose, scale, nearest, BIAS_M + slope / scale, open_sky)
     light[rows, columns] = DARKEST + (1 - DARKEST) * open_sky / DIRECTIONS
@@ -63,7 +63,7 @@ def sky_light(
 
 @njit(cache=True, nogil=True)
 def _count_unoccluded(points_m, pose, scale, nearest_m, bias_m, count):
-    """Add 1 to the count of each point with nothing nearer than itself in an orthographic depth
+    """Count one more open direction for each point that is not occluded in an orthographic depth
     map."""
     m, side = pose, len(nearest_m)
     for i in range(len(points_m)):

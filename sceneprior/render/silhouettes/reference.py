@@ -17,12 +17,12 @@ MIN_AREA_PX2 = 1e-12
 """Twice the area in px**2 up to which a projected face counts as degenerate and is not drawn."""
 
 PIECE_PX = 4.0
-"""Maximum length in pixels of the equal pieces into which an edge is cut. A piece belongs to the
-outline as a whole or not at all."""
+"""Maximum length in pixels of the equal pieces into which an edge is cut. A piece is either wholly
+on the outline or not on it."""
 
 ASIDE_PX = 1e-3
-"""Distance in pixels from the middle of a piece to the point beside it at which faces are looked
-for."""
+"""Distance in pixels between the middle of a piece and a test point beside it. The piece is part of
+the outline if no face covers this point."""
 
 SLACK = 1e-6
 """Tolerance on barycentric weights for ids and depths, so that rounding leaves no gap at a pixel
@@ -129,8 +129,7 @@ def _faces(grid: Tensor, corners: Tensor, z: Tensor, settings: Settings) -> tupl
 def _outline(
     grid: Tensor, pixels: Tensor, depths: Tensor, faces: Tensor, keep: Tensor, settings: Settings
 ) -> tuple[Tensor, ...]:
-    """The fast mode: coverage by the mesh's outline, the depth that decides which object is in
-    front, and the depth itself."""
+    """The fast mode: coverage by the mesh's outline, order depth, and depth."""
     corners, z = pixels[faces[keep]], depths[faces[keep]].detach()
     weights = _weights(grid, corners.detach())
     contained = (weights > -SLACK).all(dim=-1)

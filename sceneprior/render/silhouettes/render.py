@@ -13,7 +13,7 @@ from sceneprior.core.geometry.cameras import project
 from sceneprior.render.silhouettes.reference import Settings
 
 NEAR_FACE_M = 0.05
-"""Least depth in metres; a face with a nearer corner is left out of that view."""
+"""Minimum depth in metres; a face with a nearer corner is not drawn in that view."""
 
 SIGMA_NDC = 1e-4
 """The paper's blend sigma, in squared NDC (the shorter image side spans [-1, 1])."""
@@ -29,9 +29,9 @@ class RenderedScene(NamedTuple):
     masks: Float[Tensor, "rooms views objects height width"]
     """Soft masks in [0, 1], differentiable in the vertices."""
     front: Int[Tensor, "rooms views height width"]
-    """Index of the front-most object at each pixel centre; -1 for none."""
+    """Index, among the room's objects, of the nearest object at each pixel centre; -1 for none."""
     depth_m: Float[Tensor, "rooms views height width"]
-    """Depth of that object along the optical axis; infinite for none."""
+    """Depth of the nearest object along the optical axis; infinite for none."""
 
 
 def sigma_from_ndc(sigma_ndc: float, image_size: tuple[int, int]) -> float:
@@ -54,7 +54,7 @@ def render_scene(
     drawn: Bool[Tensor, "rooms objects"] | None = None,
     backend: str = "auto",
 ) -> RenderedScene:
-    """Draw every object's soft mask, and the front-most object, in every view of its room.
+    """Draw every object's soft mask, and find the nearest object, in every view of its room.
 
     In `exact` mode a pixel is covered unless every face misses it:
 
@@ -81,11 +81,12 @@ def render_scene(
         blur_ndc: Squared blur radius in squared NDC; None uses the authors' value, log(1 / 1e-4 -
             1) * sigma, at which the sigmoid is 1e-4.
         mode: `exact` or `fast`.
-        compositing: `layered` or `paper` (visible masks, see `cpu/compositing.py`), or `alone`.
+        compositing: Treatment of occlusion. `layered` (alpha compositing) and `paper` give visible
+            masks, see `cpu/compositing.py`. `alone` draws each object as if there were no others.
         drawn: True for the objects to draw; the others get empty masks and occlude nothing. None
             draws all objects.
-        backend: `cpu` (Numba), `cuda` (Triton), `reference` (plain torch), or `auto`: the fast
-            backend of the tensors' device.
+        backend: `cpu` (Numba), `cuda` (Triton), `reference` (plain torch), or `auto`: `cpu` or
+            `cuda` by the device of the vertices, on other devices `reference`.
 
     Raises:
         ValueError: an unknown mode, a sigma that is not positive, a vertex index out of range, or a

@@ -96,7 +96,7 @@ def certify_pieces(
 def _pieces_near(
     shapes, clear, first, last, piece_count, top_row, left_column, reach
 ):  # pragma: no cover - compiled
-    """Bit mask: bit i is set if piece first + i is outline and its blur may reach the tile."""
+    """Bit mask: bit i is set if outline piece first + i may reach the tile with its blur."""
     lane = tl.arange(0, BLOCK)
     piece = first + lane
     known = piece < last

@@ -116,7 +116,7 @@ def find_windows(
     meshes = (pixels, depths, faces, drawn.to(torch.uint8).contiguous(), settings)
     face_bounds, block_bounds, places = _bound(*meshes, reach_of(settings))
     if settings.mode == "fast":
-        # The window includes the blur, but faces are rasterised hard, with bounds of their own.
+        # The window includes the blur, but faces are rasterised hard, with separate bounds.
         face_bounds, block_bounds, _ = _bound(*meshes, REACH_MARGIN_PX)
     counts = places[:, 2].long() * places[:, 3]
     ends = counts.cumsum(dim=0)
