@@ -1,4 +1,7 @@
-"""Pages of the site that are made from code: the reference of all commands."""
+"""Pages of the site from outside of docs/: the reference of all commands, and configs/README.md."""
+
+from pathlib import Path
+from typing import Any
 
 import typer.cli
 from mkdocs.config.defaults import MkDocsConfig
@@ -7,11 +10,20 @@ from typer.main import get_command
 
 from sceneprior.apps.cli.commands import app
 
+CONFIGS = Path(__file__).parents[1] / "configs" / "README.md"
+
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add `cli.md`."""
+    """Add `cli.md` and `configs.md`."""
     files.append(File.generated(config, "cli.md", content=commands_page()))
+    text = CONFIGS.read_text().replace("](../docs/", "](")
+    files.append(File.generated(config, "configs.md", content=text))
     return files
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Links to configs/README.md lead to its page."""
+    return markdown.replace("](../configs/README.md", "](configs.md")
 
 
 def commands_page() -> str:
