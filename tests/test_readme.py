@@ -23,7 +23,7 @@ def commands_under(page: str, heading: str) -> list[str]:
 
 @pytest.mark.slow
 def test_steps_run_as_printed(tmp_path):
-    commands = commands_under("docs/tutorial.md", "2. Try it on rooms that it makes itself")
+    commands = commands_under("docs/tutorial.md", "2. Try the package on rooms that it makes")
     for command in commands:
         program, *arguments = shlex.split(command)
         assert program == "sceneprior"
