@@ -10,7 +10,9 @@ from typer.testing import CliRunner
 from sceneprior.apps.cli.commands import app
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [
+    ROOT / "README.md", ROOT / "configs/README.md", *sorted((ROOT / "docs").rglob("*.md"))
+]  # fmt: skip
 
 
 class Block(NamedTuple):
