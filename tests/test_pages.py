@@ -41,7 +41,8 @@ RUN_HERE = [
     "README.md", "configs/README.md", "docs/index.md", "docs/tutorial.md", "docs/concepts.md",
     "docs/uses.md", "docs/reconstruction.md", "docs/evaluation.md", "docs/cluster.md",
     "docs/comparing.md", "docs/baselines_2d.md", "docs/baselines_3d.md",
-    "docs/baselines_single_view.md",    "docs/paper_map.md", "docs/requests.md", "docs/simulators.md", "docs/captures.md",
+    "docs/baselines_single_view.md", "docs/paper_map.md", "docs/requests.md", "docs/simulators.md",
+    "docs/captures.md",
 ]  # fmt: skip
 WHOLE_PAGES = {
     "docs/posed_data.md": "tests/data_prep/posed/test_docs.py",
