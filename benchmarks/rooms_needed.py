@@ -155,6 +155,7 @@ def plot(rows: Sequence[dict[str, Any]], path: Path) -> None:
             axes.plot([r["rooms"] for r in mine], [r[key] for r in mine], marker="o", label=label)
         axes.set_xscale("log")
         axes.set_xticks(sizes := sorted({row["rooms"] for row in rows}), map(str, sizes))
+        axes.minorticks_off()
         axes.set_xlabel("training rooms")
         axes.set_title(title, fontsize=10)
         axes.grid(alpha=0.3)
