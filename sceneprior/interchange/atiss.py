@@ -45,7 +45,8 @@ def write_atiss(scenes: Sequence[Scene], folder: Path) -> None:
 
 
 def floor_plan(floor: shapely.Geometry) -> dict[str, np.ndarray]:
-    """ATISS's arrays of a floor plan: triangles at y = 0 that face up, and the origin as centroid.
+    """Convert a floor polygon to ATISS's arrays: triangles at y = 0 that face up, and the origin as
+    centroid.
 
     >>> floor_plan(shapely.box(-1, -1, 1, 1))["floor_plan_faces"].shape
     (2, 3)

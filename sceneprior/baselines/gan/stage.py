@@ -74,7 +74,7 @@ class GanTraining(TrainConfig):
 
     epochs: int = Field(400, ge=1)
     batch_size: int = Field(16, ge=1)
-    """Real rooms per step, and as many generated ones."""
+    """Number of real rooms per step; equally many rooms are generated."""
     accumulate: Literal[1] = 1
     """Every batch updates both networks."""
     views_per_room: int = Field(4, ge=1)
@@ -95,7 +95,7 @@ class GanTraining(TrainConfig):
     """Standard deviation of the noise on all maps at the start; it falls to 0 over the epochs.
     Without it, classes can be lost permanently."""
     clip_gradient: float = Field(1.0, ge=0)
-    """Norm to which the gradients of each network are clipped; 0 turns clipping off."""
+    """Maximum gradient norm of each network; 0 turns clipping off."""
     silhouettes: Literal["exact", "fast"] = "fast"
     """See `ShapeConfig`."""
 

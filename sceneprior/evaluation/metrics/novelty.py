@@ -14,8 +14,7 @@ from sceneprior.evaluation.layout_distance import MISSING_M, nearest_distances
 from sceneprior.evaluation.metric import GENERATED, Comparison, Metric, RoomSet, TableColumn
 
 NEAR_COPY_QUANTILE = 0.01
-"""Share of real training rooms that count as near copies of another one, which sets the
-threshold."""
+"""Share of real training rooms that count as near copies of another; it sets the threshold."""
 THRESHOLD_ROOMS = 500
 """Largest number of training rooms for measuring the threshold; thousands would take minutes."""
 
