@@ -34,7 +34,7 @@ from sceneprior.paper.trained import TrainedPrior
 from sceneprior.render.silhouettes.render import render_scene
 
 VIEWS = 4
-"""Views of each training room in which its decoded masks are compared."""
+"""Number of views per training room in which decoded masks are compared."""
 _BATCH = 8
 _NOTE = (
     "The rooms of these shards are known from views alone: objects are counted as they appear in "
@@ -162,7 +162,7 @@ def mask_iou_of_rooms(trained: TrainedPrior, views: SceneViews) -> float:
 
 
 def _counted(shards: Path, split: str, names: str) -> Int[np.ndarray, "rooms classes"]:
-    """Tracked objects of each class in each room, void left out."""
+    """Number of tracked objects of each class in each room, void left out."""
     tables = []
     for shard, room_id in iterate_rooms(shards, split):
         if shard.label_set != names:

@@ -121,7 +121,7 @@ METRICS = (
             "the larger set as the smaller one has; interval: over rooms, classifiers not retrained"
         },
         column=TableColumn(
-            "SCA", 2, "SCA: accuracy of a classifier that tells generated from test rooms"
+            "SCA", 2, "SCA: accuracy of a classifier that separates generated and test rooms"
         ),
     ),
 )  # fmt: skip
