@@ -143,7 +143,7 @@ def prep_scannet(
     only: Annotated[str | None, typer.Option(help="A scan, or a prefix of scans' names.")] = None,
     retry_failed: RetryOption = False,
 ) -> None:
-    """Turn ScanNet's recordings into view shards, straight from .sens and the zips.
+    """Turn ScanNet's recordings into view shards, directly from .sens files and zips.
 
     Exit status: 0, or 3 if scans failed (the others are prepared; report.csv says why).
     """

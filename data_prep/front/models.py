@@ -14,7 +14,7 @@ from sceneprior.core.scene import Mesh
 _NO_FURNITURE_M = 10.0
 """Longest plausible side of a model; nearly all models in centimetres exceed it."""
 _OVERSIZED = (50.0, 200.0)
-"""Range of the ratio longest side / longest side stated by the house for a file in centimetres."""
+"""Range of the ratio between a mesh's longest side and the house's statement, for centimetres."""
 _CACHE_BYTES = 512 * 2**20
 """Size of a process's mesh cache: about two thousand models of 3D-FUTURE's usual size."""
 

@@ -1,4 +1,4 @@
-"""Reads Hypersim: synthetic scenes with trajectories of cameras, which may be tilt-shift ones.
+"""Reads Hypersim: synthetic scenes with camera trajectories; cameras may be tilt-shift.
 
     <folder>/metadata_camera_parameters.csv     projection of each scene (contrib/mikeroberts3000)
     <folder>/<scene>/_detail/metadata_scene.csv meters_per_asset_unit
@@ -191,7 +191,7 @@ def _image(path: Path, size: tuple[int, int]) -> np.ndarray:
 
 
 def _boxes(folder: Path, unit: float) -> dict[int, np.ndarray]:
-    """Boxes by instance + 1, in metres with y up, of the instances that have a valid one."""
+    """Boxes in metres with y up, by instance + 1, for instances with a valid box."""
     positions, axes, extents = (
         read_hdf5(folder / _BOXES.format(name), ("dataset",), _HINT)[0]
         for name in ("positions", "orientations", "extents")

@@ -107,7 +107,7 @@ class Scan:
 
     @property
     def scan_id(self) -> str:
-        """Id of the scan, such as `scene0000_00`; each scan of a space is a room of its own."""
+        """Id of the scan, such as `scene0000_00`; each scan of a space is a separate room."""
         return self.folder.name
 
 

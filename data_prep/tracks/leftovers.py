@@ -11,8 +11,8 @@ ENOUGH = 0.6
 HULL, CLASS, PAIRS, SAME_VIEWS = 4.0, 1.0, 2.0, -2.0
 """Weights of hulls, of classes, of the mean weight of pairs, and of common views."""
 FEW = 6.0
-"""Gain of joining a cluster of one mask to any other, since most objects are seen more often; a
-cluster of n masks gains a part n of it."""
+"""Gain of joining a cluster of one mask to any other cluster, since most objects are visible more
+often; for a cluster of n masks, the gain is divided by n."""
 
 
 def join_leftovers(
@@ -22,8 +22,7 @@ def join_leftovers(
     mask_view: Int[np.ndarray, " masks"],
     mask_class: Int[np.ndarray, " masks"],
 ) -> Int[np.ndarray, " masks"]:
-    """Join each cluster, the smallest first, to the larger cluster with the largest gain, if that
-    is positive.
+    """Join each cluster, the smallest first, to the larger cluster with the largest positive gain.
 
     The gain is the sum of
 
