@@ -23,12 +23,14 @@ _SHIFTS = tuple((across, down) for across in _OFF for down in _OFF if across or 
 
 
 class Cause(NamedTuple):
-    """A mistake in a room's cameras. Its family is one of the following; fields that a family does
-    not use keep their defaults. given: no mistake. poses: the matrices hold `reading` with `axes`;
-    the world is left-handed if the axes are. order: frames are in the order `detail`. focal: focal
-    lengths must be multiplied by `factor`. center: the principal point must be moved by `shift`.
-    middle: the principal point must be at the image centre. size: the intrinsics belong to pictures
-    of another size. chance: the cameras belong to other frames.
+    """A mistake in a room's cameras.
+
+    Its family is one of the following; fields that a family does not use keep their defaults.
+    given: no mistake. poses: the matrices hold `reading` with `axes`; the world is left-handed if
+    the axes are. order: frames are in the order `detail`. focal: focal lengths must be multiplied
+    by `factor`. center: the principal point must be moved by `shift`. middle: the principal point
+    must be at the image centre. size: the intrinsics belong to pictures of another size. chance:
+    the cameras belong to other frames.
     """
 
     family: str

@@ -15,8 +15,10 @@ _LISTED = 3
 
 
 class MaskFormat(ABC):
-    """The masks of one room in one tool's format. `folder` is the room's folder. `label_set_name`
-    decides whether walls and floors are objects, in formats that distinguish them from objects.
+    """The masks of one room in one tool's format.
+
+    `folder` is the room's folder. `label_set_name` decides whether walls and floors are objects, in
+    formats that distinguish them from objects.
     """
 
     name: ClassVar[str]

@@ -122,9 +122,10 @@ def path_text(name: str) -> str:
 
 
 def ids_path(folder: Path, name: str) -> Path:
-    """Path of a frame's instance-id PNG; `name` is the frame's `file_path`. The path is
-    `instances/<name without its extension>.png` if that exists (for frames in several folders),
-    else `instances/<stem>.png`.
+    """Path of a frame's instance-id PNG; `name` is the frame's `file_path`.
+
+    The path is `instances/<name without its extension>.png` if that exists (for frames in several
+    folders), else `instances/<stem>.png`.
     """
     path = Path(_as_png(path_text(name)))
     whole = folder / INSTANCES / path

@@ -23,11 +23,15 @@ def pair_weights(
     mask_view: Int[np.ndarray, " masks"],
     mask_class: Int[np.ndarray, " masks"],
 ) -> Float[np.ndarray, "masks masks"]:
-    """Weight of each pair of masks, from the cells that the views of both masks see. Mask a shows n
-    cells that b's view also sees, and b shows the share q of these. The log-odds q log(SAME /
-    OTHER) + (1 - q) log((1 - SAME) / (1 - OTHER)) are computed in both directions, averaged, and
-    weighted by STRENGTH (1 - exp(-n / ENOUGH)). The log-odds of equal or unequal classes are added,
-    with the same weight but for STRENGTH. `shown` is that of `Surface`.
+    """Weight of each pair of masks, from the cells that the views of both masks see.
+
+    Mask a shows n cells that b's view also sees, and b shows the share q of these. The log-odds
+
+        q log(SAME / OTHER) + (1 - q) log((1 - SAME) / (1 - OTHER))
+
+    are computed in both directions, averaged, and weighted by STRENGTH (1 - exp(-n / ENOUGH)). The
+    log-odds of equal or unequal classes are added, with the same weight but without STRENGTH.
+    `shown` is that of `Surface`.
     """
     count = len(mask_view)
     member = np.zeros((len(shown), count + 1), dtype=np.float32)

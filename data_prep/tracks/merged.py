@@ -35,8 +35,10 @@ def split_merged(
     cameras: Cameras,
     grid: Grid,
 ) -> tuple[Int[np.ndarray, "views rows columns"], Split]:
-    """Cut masks that show several clusters into parts. A part is kept if its rays meet the hull of
-    its own cluster, but not the hull of the mask's cluster, which might be behind the part.
+    """Cut masks that show several clusters into parts.
+
+    A part is kept if its rays meet the hull of its own cluster, but not the hull of the mask's
+    cluster, which might be behind the part.
 
     Args:
         full: Images of ids at full size; `cameras` sees every `step`-th row and column.

@@ -1,6 +1,7 @@
-"""Finds the cells of a room's grid that masks may show, and projects cells into the views. A cell
-is kept if enough views see a mask there rather than background. The result is the visual hull of
-all objects together, tolerant of missing masks and independent of their ids.
+"""Finds the cells of a room's grid that masks may show, and projects cells into the views.
+
+A cell is kept if enough views see a mask there rather than background. The result is the visual
+hull of all objects together, tolerant of missing masks and independent of their ids.
 """
 
 from typing import NamedTuple, no_type_check

@@ -1,4 +1,5 @@
 """Commands that generate or complete rooms, or retrieve models; dependencies load when called.
+
 Pictures are rendered by the z-buffer, because without a GPU, GL is slower and takes a second to
 start.
 """

@@ -1,5 +1,6 @@
-"""The package's own procedural furniture (`sceneprior/furniture`), as CAD models by class. Nothing
-is stored: a class is built when an object first needs it, in 10 to 100 ms.
+"""The package's own procedural furniture (`sceneprior/furniture`), as CAD models by class.
+
+Nothing is stored: a class is built when an object first needs it, in 10 to 100 ms.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

@@ -186,8 +186,9 @@ class Explorer:
         return Shown(room.scene, f"path, step {number} of {PATH_STEPS - 1}")
 
     def complete(self, shown: Shown, seed: int, want: str = "") -> Shown:
-        """Complete the room around the kept objects, with wishes if there are any. The shown room's
-        floor, doors, windows and ceiling also stay.
+        """Complete the room around the kept objects, with wishes if there are any.
+
+        The shown room's floor, doors, windows and ceiling also stay.
         """
         room = self.prior.complete(shown.given(), 1, seed, want=want or None)[0]
         kept = frozenset(range(len(shown.kept)))

@@ -48,11 +48,13 @@ class Sync2genModel(Section):
 
 
 class Sync2Gen(nn.Module):
-    """A variational auto-encoder of rooms. A room is a matrix with `slots` slots per class; each
-    slot holds the attributes of one object, standardised per class, or is empty. Objects of a class
-    fill its slots in order of x, then z; those beyond the last slot are left out. Sparse and dense
-    layers alternate, which reduces overfitting. `seed` chooses the connections of sparse layers and
-    the offsets that `PairPrior` keeps. `classes` is the size of the label set with void.
+    """A variational auto-encoder of rooms.
+
+    A room is a matrix with `slots` slots per class; each slot holds the attributes of one object,
+    standardised per class, or is empty. Objects of a class fill its slots in order of x, then z;
+    those beyond the last slot are left out. Sparse and dense layers alternate, which reduces
+    overfitting. `seed` chooses the connections of sparse layers and the offsets that `PairPrior`
+    keeps. `classes` is the size of the label set with void.
     """
 
     mean_m: Tensor

@@ -113,9 +113,9 @@ def refuse(number: int):
             errno.ENOSPC,
             "(No space left on device); free space on its disk, or name another folder.",
         ),
-        (errno.EROFS, "(Read-only file system); name a place that can be written."),
+        (errno.EROFS, "(Read-only file system); name a folder that can be written."),
         (errno.EACCES, "(Permission denied); change its permissions, or name another"),
-        (errno.EDQUOT, "(Disk quota exceeded); make room in your quota"),
+        (errno.EDQUOT, "(Disk quota exceeded); free space in your quota"),
         (errno.EMFILE, "(Too many open files); allow more open files with `ulimit -n 4096`."),
     ],
 )
