@@ -2,8 +2,8 @@
 
 Run `python benchmarks/turned_rooms.py SHARDS ... [--noise 0 1]`. The shards must hold 3D ground
 truth in rooms whose walls are aligned with the axes, like those of `prep-front`. Each room is
-turned by a random angle; the noise is that of tracks.py, with the ids of the true objects.
-`--pieces` measures furniture at an angle to the walls instead.
+turned by a random angle; the noise is the same as in tracks.py, but ids are those of the true
+objects. `--pieces` measures furniture at an angle to the walls instead.
 """
 
 import argparse

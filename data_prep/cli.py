@@ -111,7 +111,7 @@ def prep_front(
 def recipe(
     name: Annotated[str, typer.Argument(help="bedroom, living, dining, library, kitchen, all.")],
 ) -> None:
-    """Print a recipe of prep-front, to start one of your own: recipe bedroom > mine.yaml."""
+    """Print a recipe of prep-front, as a template for your own: recipe bedroom > mine.yaml."""
     from data_prep.front.recipe import recipe_text
 
     typer.echo(recipe_text(name), nl=False)

@@ -44,8 +44,9 @@ class ModelBank:
     def load(self, model_id: str) -> Mesh:
         """Load a mesh in metres. A file is read again if it changed or was evicted from the cache.
 
-        About a hundred models of the release are in centimetres. A model with a side longer than
-        10 m is taken for one of them and scaled by 0.01; `unit_of` finds those that are smaller.
+        About a hundred models of the release are in centimetres. A model with a side longer than 10
+        m is assumed to be in centimetres and scaled by 0.01; `unit_of` finds smaller models in
+        centimetres.
         """
         path = self.folder / model_id / MODEL_FILE
         return self._read(path, file_stamp(path))

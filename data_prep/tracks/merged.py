@@ -68,7 +68,7 @@ def find_merged(
     labels: Int[np.ndarray, " masks"],
     mask_view: Int[np.ndarray, " masks"],
 ) -> Split:
-    """Find masks that show a second cluster, which has no mask of its own in their view.
+    """Find masks that show a second cluster, which has no separate mask in their view.
 
     According to the other views, most of the cluster's cells that the view sees must lie in this
     mask; the mask must also show cells of its own cluster.

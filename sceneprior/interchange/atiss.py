@@ -15,7 +15,7 @@ from sceneprior.core.scene import Scene, Turned
 from sceneprior.interchange.box_lists import NOT_FURNITURE
 
 ENDS = ("start", "end")
-"""Columns that ATISS appends to those of the classes."""
+"""Columns that ATISS appends to the class columns."""
 
 
 def write_atiss(scenes: Sequence[Scene], folder: Path) -> None:

@@ -106,7 +106,7 @@ class StepRunner:
                 )  # fmt: skip
                 if self.stopped:  # a signal came while the process started
                     self.stop()
-                # wait4 returns the usage of this child alone, including that of its own children.
+                # wait4 returns the usage of this child and its descendants only.
                 _, status, used = os.wait4(process.pid, 0)
                 process.returncode = os.waitstatus_to_exitcode(status)
             finally:

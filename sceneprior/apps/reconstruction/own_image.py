@@ -72,11 +72,11 @@ def read_own_image(
 ) -> OwnImage:
     """Read an image's masks and camera.
 
-    Classes outside the run's label set become those of `SAME_CLASS`, or void.
+    Classes outside the run's label set are replaced by `SAME_CLASS`, or else by void.
 
     Args:
-        mask: A PNG of ids, or COCO's JSON, which has the classes too.
-        pose: File for `read_pose`. None assumes a camera at one of `sides` of the room, at the
+        mask: A PNG of ids, or COCO's JSON, which also has the classes. pose: File for `read_pose`.
+        None assumes a camera at one of `sides` of the room, at the
             given height or at all `CAMERA_HEIGHTS_M`, tilted by `gravity`; None is level.
     """
     if mask.suffix.lower() == ".json":

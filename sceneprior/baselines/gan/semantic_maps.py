@@ -15,7 +15,7 @@ POOLING = 2
 maps, which would otherwise distinguish them from rendered ones."""
 
 SIGMA_PX2 = 0.25
-"""Softness of rendered edges, about that of a pooled hard edge: coverage rises from 0.27 to 0.73
+"""Softness of rendered edges, chosen to match pooled hard edges: coverage rises from 0.27 to 0.73
 between half a pixel outside and half a pixel inside."""
 
 

@@ -51,8 +51,8 @@ START_ROOMS = 64
 """Number of random rooms over which the outputs are set to `STARTS`."""
 
 SHAPE_RATE = 0.1
-"""Learning rate of the shape decoder relative to that of the generator. It is low, because semantic
-maps do not rule out sheared boxes."""
+"""Learning rate of the shape decoder, relative to the generator's. It is low, because semantic maps
+do not rule out sheared boxes."""
 
 LOGIT_PENALTY = 0.01
 """Weight of `logit_penalty`. Without it, choices could become almost certain and lose their

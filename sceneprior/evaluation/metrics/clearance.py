@@ -23,8 +23,8 @@ TOLERANCE_M = 1e-6
 
 
 class Clearance(NamedTuple):
-    """Whether an object stands in front of an opening, and the share of the opening that it
-    hides."""
+    """Result for an opening: if an object stands in front of it, and the share of its area
+    covered."""
 
     blocked: bool
     covered: float

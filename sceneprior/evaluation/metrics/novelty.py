@@ -22,9 +22,9 @@ THRESHOLD_ROOMS = 500
 def near_copy_threshold(training: Sequence[Scene]) -> float:
     """The distance in metres below which a room is a near copy of a training room.
 
-    It is the 1% quantile of the distances of training rooms to the nearest other one with the same
-    furniture, up to one object more or fewer; infinite distances count. If the quantile is infinite
-    (hardly any two rooms share their furniture), it is 0, and no room is a near copy.
+    It is the 1% quantile of the distances of training rooms to the nearest other training room with
+    the same furniture, up to one object more or fewer; infinite distances count. If the quantile is
+    infinite (hardly any two rooms share their furniture), it is 0, and no room is a near copy.
     """
     rows = np.linspace(0, len(training) - 1, min(len(training), THRESHOLD_ROOMS)).astype(int)
     rooms = [training[row] for row in rows]
