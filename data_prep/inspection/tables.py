@@ -147,7 +147,7 @@ def summary(found: FolderCheck) -> str:
         parts.append(text)
     parts.append(counts(evidence))
     fit = (
-        f"masks fit the cameras by {evidence.share(GIVEN):.2f} of 1 (shuffled cameras: "
+        f"masks and cameras agree by {evidence.share(GIVEN):.2f} of 1 (shuffled cameras: "
         f"{evidence.share(CHANCE):.2f})"
     )
     if yes:

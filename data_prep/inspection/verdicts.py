@@ -63,8 +63,8 @@ def find_mistake(
     if evidence.views <= evidence.rooms:
         return Finding(
             "views",
-            "there is one frame a room, which shows no depth: give at least two, from different "
-            "places, and better twenty",
+            "there is only one frame per room, which shows no depth: give at least two from "
+            "different places, better twenty",
         )
     if evidence.ids >= _SOME_IDS and evidence.once > _ONCE * evidence.ids and evidence.views > 2:
         why = f"{evidence.once} of {evidence.ids} ids are in one image only"

@@ -128,8 +128,8 @@ def of_ids(evidence: Evidence, why: str, given: Given) -> str:
 def counts(evidence: Evidence) -> str:
     """Text with the mean number of ids per image, and of images per id."""
     return (
-        f"{evidence.masks / max(evidence.views, 1):.1f} ids an image, "
-        f"{evidence.masks / max(evidence.ids, 1):.1f} images an id"
+        f"{evidence.masks / max(evidence.views, 1):.1f} ids per image, "
+        f"{evidence.masks / max(evidence.ids, 1):.1f} images per id"
     )
 
 

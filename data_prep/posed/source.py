@@ -131,7 +131,7 @@ class PosedSource:
         sentences = []
         if single := sum(len(recording.frames) < 2 for recording in recordings):
             sentences.append(
-                f"{single} of {count} rooms have one frame, which shows no depth: objects are "
+                f"{single} of {count} rooms have only one frame, which shows no depth: objects are "
                 "lifted to 3D from at least two views, better twenty."
             )
         if untracked and settings.tracks != "auto":
@@ -173,7 +173,7 @@ class PosedSource:
             if other := tops.count(axis):
                 sentences.append(
                     f"In {other} of {count} rooms the tops of the pictures point along {axis}, but "
-                    f"{taken} is taken as up: is it --up {axis}?"
+                    f"{taken} is taken as up; should it be --up {axis}?"
                 )
         return sentences
 

@@ -54,7 +54,7 @@ class PosedSettings:
         for name in ("max_side", "max_views"):
             value = getattr(self, name)
             if value is not None and value < 1:
-                raise InputError(f"{name} is {value}; it counts from 1.")
+                raise InputError(f"{name} is {value}; expected at least 1.")
         for name in ("camera_height_m", "metres_per_unit"):
             if not 0 < getattr(self, name) < float("inf"):
                 raise InputError(f"{name} is {getattr(self, name)}; it must be above 0.")

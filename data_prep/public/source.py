@@ -93,7 +93,7 @@ class PublicSource:
         for name in ("max_side", "max_views"):
             value = getattr(self, name)
             if value is not None and value < 1:
-                raise InputError(f"{name} is {value}; it counts from 1.")
+                raise InputError(f"{name} is {value}; expected at least 1.")
         sizes = {"max_side": self.max_side, "max_views": self.max_views}
         return {
             "recipe": {**sizes, **self.reader.settings()},

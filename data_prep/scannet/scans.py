@@ -54,7 +54,7 @@ class ScanSettings:
             raise InputError(f"masks is '{self.masks}'; choose {' or '.join(MASK_FILES)}.")
         for name in ("frame_step", "max_views"):
             if getattr(self, name) < 1:
-                raise InputError(f"{name} is {getattr(self, name)}; it counts from 1.")
+                raise InputError(f"{name} is {getattr(self, name)}; expected at least 1.")
 
 
 @dataclass(frozen=True)

@@ -96,7 +96,9 @@ def stand_all(scenes: Sequence[Scene]) -> tuple[list[Scene], list[str]]:
     if not listed:
         return standing, []
     total = sum(len(scene.objects) for scene in scenes)
-    return standing, [f"So that nothing falls over or overlaps, of {total} objects: {listed}."]
+    return standing, [
+        f"Changed so that nothing falls over or overlaps: {listed} (of {total} objects)."
+    ]
 
 
 def _moved_walls(scenes: Sequence[Scene]) -> list[str]:

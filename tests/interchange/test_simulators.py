@@ -64,7 +64,7 @@ def test_mujoco_gets_primitives_that_stand(tmp_path):
 def test_mujoco_loads_a_room_with_walls_in_which_nothing_overlaps(scene, tmp_path):
     mujoco = pytest.importorskip("mujoco", reason="no mujoco here: pip install -e '.[sim]'")
     assert export_scenes([scene], "mujoco", tmp_path) == [
-        "So that nothing falls over or overlaps, of 3 objects: 1 set down.",
+        "Changed so that nothing falls over or overlaps: 1 set down (of 3 objects).",
         "Walls of 1 rooms stand further out than floor_m, by up to 0.30 m, because furniture "
         "stands there.",
     ]

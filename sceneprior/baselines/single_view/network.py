@@ -60,7 +60,7 @@ class SingleViewConfig(OneStageConfig):
         if self.data.augment_rotations:
             raise ValueError(
                 f"data.augment_rotations is true, but method: {self.method} sees each room turned "
-                "until the camera looks along +z, so that turned copies are all the same to it; "
+                "until the camera looks along +z, so turned copies would all be the same; "
                 "set it to false"
             )
         return self

@@ -53,6 +53,6 @@ def _oob(scene: Scene) -> Counts:
 METRICS = (
     Metric(
         "sceneeval_oob_objects", "OOB: objects out of bounds (SceneEval)",
-        "share; known floors alone", "lower", _oob, USED,
+        "share; known floors only", "lower", _oob, USED,
     ),
 )  # fmt: skip

@@ -125,10 +125,10 @@ def _clearance(scene: Scene) -> Counts:
 METRICS = (
     Metric(
         "sceneeval_clear_openings", "Doors and windows with nothing before them (SceneEval)",
-        "share; known openings alone", "higher", _clearance, USED,
+        "share; known openings only", "higher", _clearance, USED,
     ),
     Metric(
         "sceneeval_covered_openings", "Area of doors and windows that is covered (SceneEval)",
-        "share; known openings alone", "lower", _clearance, USED,
+        "share; known openings only", "lower", _clearance, USED,
     ),
 )  # fmt: skip

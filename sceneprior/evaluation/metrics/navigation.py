@@ -161,18 +161,18 @@ def _reach(scene: Scene) -> Counts:
 METRICS = (
     Metric(
         "sceneeval_navigability", "NAV: navigable in one piece (SceneEval)",
-        "share of free floor; known floors alone", "higher", _nav, USED,
+        "share of free floor; known floors only", "higher", _nav, USED,
     ),
     Metric(
-        "physcene_out", "R_out: objects beyond the floor (PhyScene)", "share; known floors alone",
+        "physcene_out", "R_out: objects beyond the floor (PhyScene)", "share; known floors only",
         "lower", _reach, USED,
     ),
     Metric(
-        "physcene_reach", "R_reach: objects within reach (PhyScene)", "share; known floors alone",
+        "physcene_reach", "R_reach: objects within reach (PhyScene)", "share; known floors only",
         "higher", _reach, USED,
     ),
     Metric(
         "physcene_walkable", "Walkable in one piece (PhyScene)",
-        "share of free floor; known floors alone", "higher", _reach, USED,
+        "share of free floor; known floors only", "higher", _reach, USED,
     ),
 )  # fmt: skip

@@ -147,7 +147,7 @@ def _respace(scene: Scene) -> Counts:
 
 METRICS = (
     *(
-        Metric(key, title, "mean, litres; known floors alone", "lower", _respace, USED)
+        Metric(key, title, "mean, litres; known floors only", "lower", _respace, USED)
         for key, title in (
             ("respace_oob_litres", "OOB: volume out of the room (ReSpace)"),
             ("respace_mbl_litres", "MBL: volume shared by objects (ReSpace)"),
@@ -156,6 +156,6 @@ METRICS = (
     ),
     Metric(
         "respace_valid", "Rooms with a PBL of at most 100 litres (ReSpace)",
-        "share; known floors alone", "higher", _respace, USED,
+        "share; known floors only", "higher", _respace, USED,
     ),
 )  # fmt: skip

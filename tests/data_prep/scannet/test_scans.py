@@ -152,7 +152,7 @@ def test_masks_of_another_shape_than_the_colour_frames(scan, labels):
     ("change", "words"),
     [
         ({"masks": "best"}, "masks is 'best'; choose filt or raw"),
-        ({"frame_step": 0}, "frame_step is 0; it counts from 1"),
+        ({"frame_step": 0}, "frame_step is 0; expected at least 1"),
     ],
 )
 def test_settings_that_mean_nothing(change, words):
