@@ -126,7 +126,7 @@ def _train(arguments: argparse.Namespace) -> None:
 
 
 def _all_reduce_s(size: int, device: torch.device, repeats: int = 20) -> float:
-    """Median seconds of an all-reduce of `size` bytes of float32 over the processes."""
+    """Median time in seconds to all-reduce `size` bytes of float32 over the processes."""
     numbers, times = torch.ones(size // 4, device=device), []
     for _ in range(repeats):
         dist.barrier()

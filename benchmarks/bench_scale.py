@@ -5,8 +5,8 @@
 For each number of rooms, separate processes make bedrooms, prepare them with two workers, and
 inspect them; load every room's 20 views with masks at a quarter of the size, twice; and train a few
 steps of both stages of the paper's run (configs/paper/bedroom.yaml). For each step, the table lists
-wall clock, CPU seconds of the process and its children, peak memory of the largest of them, and the
-exponent of the growth of CPU seconds from each number of rooms to the next.
+wall clock, CPU seconds of the process and its children, peak memory of the largest process, and the
+growth exponent of CPU seconds from each number of rooms to the next.
 
 The benchmark also times a layout step of the paper's size with as many objects as bedrooms, living
 rooms and ScanNet scenes hold (128 rooms of 20 views, one thread), and extrapolates the paper's full

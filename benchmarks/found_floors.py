@@ -2,12 +2,12 @@
 
     python benchmarks/found_floors.py SHARDS [--split test] [--noisy] [--homes HOMES]
 
-The shards must hold stuff and 3D ground truth, like those of `prep-front`. The error of a wall is
-the larger distance of its ends from the line of the nearest side of the true floor, and a side is
-found if walls cover half of it. `--homes` is the folder of the houses, for the true doors; a door
-is found if both ends are within 15 cm. With `--noisy`, each pose is displaced by 1 cm and 0.5
-degrees, and the outlines of masks are displaced by a standard deviation of one pixel in images with
-240 pixels along the longer side.
+The shards must hold stuff and 3D ground truth, like those of `prep-front`. A wall's error is the
+larger distance of its ends from the line through the nearest true side. A true side counts as found
+if walls cover half of it. `--homes` is the folder of the houses, for the true doors; a door is
+found if both ends are within 15 cm. With `--noisy`, each pose is displaced by 1 cm and 0.5 degrees,
+and the outlines of masks are displaced by a standard deviation of one pixel in images with 240
+pixels along the longer side.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Profile of training steps: the time of every part of a step, for each stage of a run.
+"""Profile of training steps: time spent in each part of a step, for each stage of a run.
 
     python benchmarks/profile_training.py [CONFIG ...] [--threads 1 2] [--steps 20] [--shards DIR]
 
@@ -132,7 +132,7 @@ def profile(name: str, shards: Path, run: Path, threads: int, steps: int) -> lis
 
 
 def medians_ms(steps: list[dict[str, float]]) -> dict[str, float]:
-    """Median ms of each part, of all parts together (CPU) and of the wall clock."""
+    """Median ms per part, for all parts together (CPU), and by the wall clock."""
     found = {part: statistics.median(step[part] for step in steps) for part in SHOWN}
     found["CPU"] = statistics.median(sum(step.values()) - step["clock"] for step in steps)
     found["clock"] = statistics.median(step["clock"] for step in steps)

@@ -91,7 +91,7 @@ def _folded(yaw_rad: Any) -> Any:
 
 
 def _votes_of_room(views: RoomViews) -> _Votes:
-    """Votes of the outlines of objects, void included, and of stuff, in evenly spread views."""
+    """Votes of the outlines of objects (void included) and stuff, in evenly spread views."""
     assert views.instance_ids is not None, "read with images"
     count = len(views.world_to_camera)
     rows = np.unique(np.linspace(0, count - 1, min(count, _VIEWS)).round().astype(int))

@@ -154,7 +154,7 @@ def _metres_per_unit(path: Path) -> float:
 
 
 def _trajectories(scene: Path, unit: float) -> tuple[list[tuple[Path, Path]], np.ndarray]:
-    """Paths of the images of ids and of classes of all frames, and camera to world in metres."""
+    """Paths of each frame's id image and class image, and camera-to-world matrices in metres."""
     images: list[tuple[Path, Path]] = []
     poses: list[np.ndarray] = []
     for folder in sorted((scene / "_detail").glob("cam_*")):

@@ -7,8 +7,8 @@ SAME, OTHER = 0.75, 0.08
 """Probability that a cell shown by one mask is also shown by the other mask, for two masks of the
 same object and of different objects."""
 STRENGTH, ENOUGH = 4.0, 10.0
-"""Weight of a pair's geometry, and the number of cells at which 63% of this weight is reached: the
-cells of a surface are not independent observations."""
+"""Maximum weight of a pair's geometry, and number of cells at which 63% of it is reached; the
+weight saturates because a surface's cells are not independent observations."""
 CLASS_ERROR = 0.05
 """Assumed share of masks with a wrong class."""
 SAME_VIEW = -4.0

@@ -9,7 +9,7 @@ from data_prep.tracks.clusters import main_classes
 ENOUGH = 0.6
 """Share of a mask's rays that must meet a cluster's hull for the hull to favour joining."""
 HULL, CLASS, PAIRS, SAME_VIEWS = 4.0, 1.0, 2.0, -2.0
-"""Weights of hulls, of classes, of the mean weight of pairs, and of common views."""
+"""Weights of the terms of the gain: hulls, classes, mean pair weight, and common views."""
 FEW = 6.0
 """Gain of joining a cluster of one mask to any other cluster, since most objects are visible more
 often; for a cluster of n masks, the gain is divided by n."""

@@ -83,7 +83,7 @@ def votes_of(
 @njit(cache=True, nogil=True)
 @no_type_check
 def direction_of(rays, row, column):
-    """World direction, of depth 1, of the ray of a pixel's centre."""
+    """World direction, scaled to depth 1, of the ray through a pixel's centre."""
     u, v = column + 0.5, row + 0.5
     x = rays[0, 0] * u + rays[0, 1] * v + rays[0, 2]
     y = rays[1, 0] * u + rays[1, 1] * v + rays[1, 2]

@@ -130,9 +130,9 @@ def pixel_of(matrix, point, height, width):
 def _is_filled(cells, low_m, cell_m, to_image, eyes_m, rays, focal_px, masks, known, coarse):
     """True for cells whose log-odds of being filled are positive, and that two views see filled.
 
-    `masks` and `known` are summed-area tables of the pixels of masks and of all but background. A
-    view sees a coarse cell filled if any mask lies in the cell's outline, and a fine cell if a mask
-    lies at the pixel of the cell's centre.
+    `masks` is the summed-area table of mask pixels, `known` that of mask and unknown pixels. A view
+    sees a coarse cell filled if any mask lies in the cell's outline, and a fine cell if a mask lies
+    at the pixel of the cell's centre.
     """
     views, height, width = masks.shape[0], masks.shape[1] - 1, masks.shape[2] - 1
     seen_filled = np.log((1 - MISSED) / (1 - BACKGROUND))

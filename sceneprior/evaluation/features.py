@@ -1,4 +1,4 @@
-"""Top-down pictures of a set of rooms, and the networks' features of them."""
+"""Renders top-down pictures of rooms, and computes network features of the pictures."""
 
 import hashlib
 import os

@@ -85,7 +85,7 @@ def measure_use(
 
 
 def measure_room(scene: Scene, options: UseOptions) -> Counts:
-    """Numerators and denominators of all metrics of use of one room."""
+    """Numerators and denominators of all metrics of use, for one room."""
     found: dict[str, tuple[float | int, float | int]] = {}
     functions: dict[Callable[..., Any], None] = dict.fromkeys(metric.function for metric in USE)
     for function in functions:
@@ -140,7 +140,7 @@ def evaluate_use(
     shards: Path | None = None,
     scores: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Compute metrics of use of generated rooms and, with shards, of real and random rooms.
+    """Compute metrics of use for generated rooms and, with shards, for real and random rooms.
 
     Args:
         shards: Shards with 3D ground truth; None measures the generated rooms alone.

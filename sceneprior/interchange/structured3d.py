@@ -54,8 +54,8 @@ class _House(NamedTuple):
 def read_annotated_room(
     path: Path, data: dict[str, Any], name: str
 ) -> tuple[np.ndarray, tuple[Opening, ...], float | None]:
-    """Outline of the floor (x, z), openings and height of the ceiling of one room, in metres. x and
-    -z are the file's x and y, and the outline has a corner only where its walls turn.
+    """Floor outline (x, z), openings and ceiling height of one room, in metres. x and -z are the
+    file's x and y, and the outline has a corner only where its walls turn.
 
     Args:
         name: The `ID` of the room, or its type if only one room has it; may be empty if the house

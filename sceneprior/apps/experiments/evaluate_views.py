@@ -53,8 +53,8 @@ def evaluate_from_views(
 ) -> dict[str, Any]:
     """Compute the metrics that need no 3D ground truth, in the format of `evaluate_synthesis`.
 
-    The result holds the scores of the generated rooms by key of `METRICS`, those of real training
-    rooms under `train_rooms`, and those of the rooms compared with under `<key>_test`.
+    The result holds the generated rooms' scores by key of `METRICS`, the real training rooms'
+    scores under `train_rooms`, and the test rooms' scores under `<key>_test`.
     """
     names = common_label_set(generated)
     rooms = {split: _counted(shards, split, names) for split in ("train", options.split)}

@@ -20,7 +20,7 @@ UNSTATED = (
     "them out before you redistribute it."
 )
 SHOWN = ("generated", "real training", "independent")
-"""Columns of the table of scores, besides the column of the test rooms."""
+"""Columns of the score table, besides the column of the test rooms."""
 
 
 def model_card(

@@ -57,7 +57,7 @@ class Shown:
 
 
 class Folder:
-    """Rooms of a folder of scenes, of any method."""
+    """A folder of scenes, made by any method."""
 
     def __init__(self, scenes: Sequence[Scene]):
         self.scenes = tuple(scenes)

@@ -154,8 +154,8 @@ def presence(found: Detections) -> Bool[Tensor, "images most"]:
 
 
 def pair_geometry(found: Detections) -> Float[Tensor, "images most most numbers"]:
-    """Sines and cosines that relate the 2D boxes of each pair of an image's masks: of log distances
-    between their middles and of log ratios of their sides."""
+    """Sine-cosine encoding of the relation between the 2D boxes of each pair of an image's masks:
+    log distances between their middles, and log ratios of their sides."""
     boxes = found.padded(found.boxes)
     sides = (boxes[..., 2:] - boxes[..., :2]).clamp(min=1e-3)
     middles = (boxes[..., 2:] + boxes[..., :2]) / 2
