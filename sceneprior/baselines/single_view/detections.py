@@ -60,8 +60,8 @@ class Detections:
 
     @property
     def numbers(self) -> Float[Tensor, "masks numbers"]:
-        """The 2D box (4), the logs of its width and height (2), whether each side is clear of the
-        image border (4), the rays through its centre and corners (15), the camera's height (1)."""
+        """The 2D box (4), the logs of its width and height (2), its sides that no other object
+        touches (4), the rays through its centre and corners (15), and the camera's height (1)."""
         x1, y1, x2, y2 = self.boxes.unbind(dim=-1)
         corners = [((x1 + x2) / 2, (y1 + y2) / 2), (x1, y1), (x2, y1), (x1, y2), (x2, y2)]
         rays = self.rays(torch.stack([torch.stack(place, dim=-1) for place in corners], dim=1))
