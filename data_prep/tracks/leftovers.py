@@ -24,14 +24,14 @@ def join_leftovers(
 ) -> Int[np.ndarray, " masks"]:
     """Join each cluster, the smallest first, to the larger cluster with the largest positive gain.
 
-    The gain is the sum of
+    With the mean share s of the smaller cluster's rays that meet the larger cluster's hull, the
+    gain is the sum of
 
-    - HULL times the excess over `ENOUGH` of the mean share of the smaller cluster's rays that meet
-      the larger one's hull (scaled to 0 to 1; three times as steep below),
+    - HULL times (s - ENOUGH) / (1 - ENOUGH) if s is above ENOUGH, else HULL times 3 (s - ENOUGH),
     - CLASS times the log-odds of the classes,
-    - PAIRS times the mean weight of pairs of different views,
+    - PAIRS times the mean weight of pairs of masks in different views,
     - SAME_VIEWS times the share of the smaller cluster's views that show both clusters, and
-    - FEW divided by the number of the smaller cluster's masks.
+    - FEW divided by the smaller cluster's number of masks.
     """
     count = int(labels.max()) + 1
     size = np.bincount(labels, minlength=count)

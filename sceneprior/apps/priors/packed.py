@@ -1,6 +1,6 @@
 """The file of a packed prior: weights, settings and a card, without executable code.
 
-It is a zip of three files, readable with any tool, and zeros compress well:
+The file is a zip, which any tool opens and which compresses zeros well, with three entries:
 
 README.md            the card (apps/priors/card.py)
 config.json          the run's settings, the stage, the classes; `PackedPrior`
