@@ -133,7 +133,7 @@ class RequestFields:
         """Show the names of request parts without a text field."""
         self._rest_said.visible = bool(self._rest)
         names = ", ".join(key.removesuffix("_m") for key in self._rest)
-        self._rest_said.content = html(f"The command's request also has: {names}.")
+        self._rest_said.content = html(f"The command also requests: {names}.")
 
 
 def _texts_of(asked: Mapping[str, Any]) -> tuple[dict[str, str], dict[str, Any]]:

@@ -142,7 +142,7 @@ def test_what_a_command_could_not_write_is_named(command, toy_run, monkeypatch, 
     monkeypatch.setattr("data_prep.homes.make._write_split", refuse(errno.ENOSPC))
     run = {"make-homes": [], "pack": [toy_run]}.get(name, ["--run", toy_run])
     said = one_sentence(command(name, *run, *more, "target"))
-    assert "target cannot be read or written (No space left on device); make room" in said
+    assert "target cannot be read or written (No space left on device); free space" in said
     assert not list(Path().iterdir())
 
 

@@ -71,7 +71,7 @@ def test_a_request_is_answered_or_refused_in_the_panel(prior):
         page = Page(server, Explorer(prior), "prior", asked=asked)
         panel, fields = page.panel, page.panel._fields
         assert fields.floor.value == "0,0 4,0 4,3 0,3"
-        assert "The command's request also has: want." in fields._rest_said.content
+        assert "The command also requests: want." in fields._rest_said.content
         assert "✓ 2 nightstand" in panel._answer.content
         fields.want.value, fields.openings.value = "double_bed: 1", "door@south"
         panel._sample(page.explorer, 1, None)
