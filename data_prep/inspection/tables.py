@@ -23,7 +23,7 @@ _JUDGED = ("fit of cameras", "in 3D", "masks within", "mean 2D IoU")
 
 
 def count_tables(folder: Path) -> list[Table]:
-    """Tables of the counts of each split, and of the objects of each class."""
+    """Tables of the counts per split, and of the objects per class."""
     names = label_set(read_index(folder)["label_set"])
     totals, classes = [], {}
     turned: list[float] = []
@@ -114,8 +114,8 @@ def _fit(checks: Sequence[RoomCheck]) -> float | None:
 
 
 def _judged(checks: Sequence[RoomCheck]) -> list[str]:
-    """Table cells: fit of masks and cameras; 3D representation, share of masks within projections,
-    IoU if fully visible."""
+    """Table cells: agreement of masks and cameras, type of 3D representation, share of masks within
+    their projections, and mean IoU of fully visible objects."""
     agreement = sum((check.agreement for check in checks), Agreement())
     cells = [
         (

@@ -34,9 +34,9 @@ candidates; None keeps `KEEP`."""
 KEEP = 16
 """Candidates (model and turn) compared by all points; None compares all: exact, and slow."""
 OTHER_TURN = 1.2
-"""Factor on the distances of models whose turn differs from the object's known yaw. A cupboard's
-model facing backwards has only 1.0 to 1.1 times the distance of one facing forwards, a chair's 1.5
-times."""
+"""Factor on the distances of models whose turn differs from the object's known yaw. Without the
+factor, a cupboard facing backwards has only 1.0 to 1.1 times the distance of one facing forwards; a
+chair has 1.5 times."""
 SURE = 0.5
 """Minimum confidence at which a yaw counts as known."""
 _BLOCK = 2**16
