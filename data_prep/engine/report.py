@@ -187,7 +187,7 @@ class Summary:
             "renderer": self.renderer,
             "summary": str(self),
         }
-        # The expected counts are those of the whole data set.
+        # Expected counts are known only for the whole data set.
         expected = self.source.expected if self.source.only is None else None
         return make_report(self.lines, about, expected)
 

@@ -109,7 +109,7 @@ def _nearness(views: RoomViews) -> float | None:
     if len(views.visible) < _LEAST_VIEWS:
         return None
     turns = views.world_to_camera[:, :3, :3].astype(np.float64)
-    cosines = np.einsum("aij,bij->ab", turns, turns)  # of the angle, times 2, plus 1
+    cosines = np.einsum("aij,bij->ab", turns, turns)  # 2 cos(angle between views) + 1
     pixels = views.mask_pixels * views.visible
     parts = pixels / np.maximum(pixels.sum(axis=1, keepdims=True), 1)
     shared = np.minimum(parts[:, None], parts[None]).sum(axis=-1)

@@ -86,7 +86,7 @@ def choose_views(folder: Path, room_id: str | None, pictures: int) -> list[tuple
         share = pictures // len(rooms) + (i < pictures % len(rooms))
         with Shard(path) as shard:
             views = len(shard.read_room(name).visible)
-        # Evenly spaced, because the views of a recording are in temporal order.
+        # Views are evenly spaced, because a recording's views are in temporal order.
         places = np.unique(np.linspace(0, views, min(share, views), endpoint=False).astype(int))
         chosen += [(path, name, int(view)) for view in places]
     return chosen

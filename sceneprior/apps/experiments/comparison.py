@@ -259,7 +259,7 @@ def _taken_over(rooms: Rooms, method: Method) -> list[str]:
     if _value(own, "model.max_objects") is not None:
         keys.append("model.max_objects")
     values = {key: _value(shared, key) for key in keys}
-    # Quoted as JSON, which is valid YAML, so that a folder called 2024 stays a string.
+    # Values are quoted as JSON, which is valid YAML, so that a folder called 2024 stays a string.
     return [f"{key}={json.dumps(v)}" for key, v in values.items() if v is not None]
 
 

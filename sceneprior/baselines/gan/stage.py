@@ -155,7 +155,7 @@ class GanStage(lightning.LightningModule):
         generator_optimizer, discriminator_optimizer = self.optimizers()  # type: ignore[attr-defined]
         scenes = self.generator.decode(self._latents(len(views.room_index)))
         with full_precision(self.device):
-            # Checked before rendering, which rejects vertices that are not finite.
+            # This is checked before rendering, which rejects vertices that are not finite.
             undecided = logit_penalty(scenes)
             check_finite(undecided + scenes.centers_m.sum() + scenes.sizes_m.sum(), views)
             real = observed_maps(views, self.classes)
