@@ -167,4 +167,4 @@ def sentence_of(error: Exception) -> str:
         return f"{error.filename} cannot be read ({error.strerror})"
     if os.environ.get(_DEBUG_VARIABLE):
         raise error
-    return " ".join(f"unexpected {type(error).__name__}: {error}".split())[:300]
+    return " ".join(f"unforeseen {type(error).__name__}: {error}".split())[:300]

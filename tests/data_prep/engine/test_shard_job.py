@@ -15,7 +15,7 @@ from sceneprior.core.shards import read_index
 
 FAILURES = {
     1: ("sentence", "its file is truncated"),
-    2: ("unforeseen", "unexpected KeyError: 'surprise'"),
+    2: ("unforeseen", "unforeseen KeyError: 'surprise'"),
     3: ("unreadable", "/nowhere/at/all cannot be read (No such file or directory)"),
     5: ("shapes", "box, room box_5: boxes has shape"),
 }

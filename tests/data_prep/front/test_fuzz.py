@@ -41,7 +41,7 @@ def test_a_job_on_damaged_houses_names_every_room(front, tmp_path):
     assert len(rooms_of(tmp_path / "shards")) == summary.statuses["prepared"]
     for line in summary.lines:
         assert line.status == "prepared" or line.reason, line
-        assert "unexpected" not in line.reason, line
+        assert "unforeseen" not in line.reason, line
     reasons = {line.house: line.reason for line in summary.lines if line.status == "failed"}
     assert "house98.json is not JSON" in reasons["house98"]
     assert "house99.json is not JSON" in reasons["house99"]

@@ -56,7 +56,7 @@ def test_damaged_files_end_in_one_sentence(tmp_path, name, damage, numbers):
                 assert isinstance(source.prepare(task, None), Line | PreparedRoom)
         except InputError as error:
             message = str(error)
-            assert "unexpected" not in message and "\n" not in message, (path, message)
+            assert "unforeseen" not in message and "\n" not in message, (path, message)
             named += path.name in message or path.parent.name in message
         path.write_bytes(whole)
     assert named

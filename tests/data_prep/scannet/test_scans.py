@@ -103,7 +103,7 @@ def scan_mask(scan, frame):
         (".sens", r"\.sens cannot be opened"),
         (".txt", r"\.txt cannot be read .No such file"),
         (".aggregation.json", "a scan without annotations"),
-        ("_vh_clean_2.0.010000.segs.json", r"segs\.json cannot be read .* which object"),
+        ("_vh_clean_2.0.010000.segs.json", r"segs\.json cannot be read .* to objects"),
         ("_vh_clean_2.ply", r"_vh_clean_2\.ply cannot be read"),
         ("_2d-instance-filt.zip", r"_2d-instance-filt\.zip is missing: .* folder\.$"),
     ],
