@@ -120,9 +120,9 @@ def reach(scene: Scene) -> Reach | None:
     Source:
         PhyScene/PhyScene, utils/overlap.py and scripts/eval/walkable_metric.py (Yang et al.,
         CVPR 2024). The published `cal_walkable_metric` returns inside its loop over areas, so it
-        gives the share of the first area in row order; here, as its variable names intend, it is
-        the largest area. Its variant for areas beside doors, which the published evaluation does
-        not use, is left out.
+        gives the share of the first area in row order; here, as the variable names intend, the
+        share of the largest area is computed. Its variant for areas beside doors, which the
+        published evaluation does not use, is left out.
     """
     from scipy.ndimage import binary_dilation
 

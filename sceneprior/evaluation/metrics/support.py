@@ -35,12 +35,12 @@ def supported(scene: Scene) -> Float[np.ndarray, " objects"]:
     """1 for supported objects, 0 for others, and NaN if unknown: SceneEval's SUPPORT.
 
     Each object has a direction of gravity: up for objects on the ceiling, backwards for objects on
-    walls, down for all others. The object is moved by 5 mm against it. Rays of 1 cm are cast along
-    it from the vertices within 1 cm of the outermost vertex, and from `max(32, 256 * area of the
-    largest face in m2)` points on each face that consists of such vertices and faces gravity. A
-    contact is the point where a ray hits the floor, a wall, the ceiling, or another object. Objects
-    on the ceiling and on walls need one contact. All others need four, and their centroid (mean of
-    triangles by area) above the convex hull of the contacts.
+    walls, down for all others. The object is moved by 5 mm against gravity. Rays of 1 cm are cast
+    along gravity from the vertices within 1 cm of the outermost vertex, and from `max(32, 256 *
+    area of the largest face in m2)` points on each face that consists of such vertices and faces
+    gravity. A contact is the point where a ray hits the floor, a wall, the ceiling, or another
+    object. Objects on the ceiling and on walls need one contact. All others need four, and their
+    centroid (mean of triangles by area) above the convex hull of the contacts.
 
     Objects on a wall or ceiling are NaN if the scene does not know that wall or ceiling. Without a
     floor outline, the rectangle around all furniture is the floor.
