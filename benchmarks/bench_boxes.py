@@ -1,8 +1,9 @@
 """Time of 2D boxes of ellipsoids: closed form against the authors' 2,562 projected vertices.
 
-Run `python benchmarks/bench_boxes.py`. A step is forward and backward, on the CPU, of a batch of
-the layout stage: 128 rooms (32 with 2,562 vertices, since more need 6 GB), 13 objects, 20 views.
-The two variants take turns, so that other load on the machine affects both; values are medians.
+Run `python benchmarks/bench_boxes.py`. A step is a forward and backward pass, on the CPU, over a
+batch of the layout stage: 128 rooms (32 with 2,562 vertices, since more need 6 GB), 13 objects, 20
+views. The two variants alternate, so that other load on the machine affects both; values are
+medians.
 """
 
 import os
@@ -44,8 +45,8 @@ def boxes_ratio(
     objects: int = 13,
     level: int = 4,
 ) -> dict[str, float]:
-    """Median seconds of a step in closed form and with an icosphere (the authors' has level 4), and
-    the ratio of the two, after one warm-up step."""
+    """Median seconds of a step in closed form and with an icosphere (level 4 in the authors' code),
+    after one warm-up step, and the ratio of the two."""
     centers, sizes, cameras, intrinsics = make_batch(rooms, views, objects)
     sphere = icosphere(level)[0].expand(rooms, objects, -1, -1)
 

@@ -1,7 +1,8 @@
 """Time of evaluating rooms: synthesis and scoring, with and without a reference file.
 
-Run `python benchmarks/bench_evaluation.py --run RUN [--shards SHARDS] [-n 1000]`. Both CPU seconds
-of all threads and wall-clock seconds are listed; on a busy machine only the former are meaningful.
+Run `python benchmarks/bench_evaluation.py --run RUN [--shards SHARDS] [-n 1000]`. CPU seconds of
+all threads and wall-clock seconds are listed; on a busy machine, only the CPU seconds are
+meaningful.
 """
 
 import argparse

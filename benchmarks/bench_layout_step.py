@@ -1,17 +1,18 @@
-"""Time of a training step of the layout stage, in this package and in the authors' way.
+"""Time of a training step of the layout stage, in this package and done like the authors' code.
 
     python benchmarks/bench_layout_step.py [--rooms 128] [--objects 13]
 
-A step is forward, losses, backward and Adam at the paper's size (configs/paper/bedroom.yaml: width
-512, 13 objects, 22 classes; 20 views per room) on the CPU.
+A step consists of forward pass, losses, backward pass and Adam, at the paper's size
+(configs/paper/bedroom.yaml: width 512, 13 objects, 22 classes; 20 views per room) on the CPU.
 
 `theirs` projects the 2,562 vertices of an icosphere for every object, and computes boxes, matching
 and losses room by room in a Python loop. Both variants use this package's decoder, losses and
 optimiser, and `theirs` runs the backward pass room by room, which saves memory; both choices are in
-its favour. `plain` is our step with the transformer of tests/references/scene_decoder.py, in plain
-layers. `products_s` is the time that the matrix products of our step alone would take at the rate
-of a large product. The variants take turns, so that other load affects all; values are medians. On
-a busy machine, rely on CPU time with one thread (OMP_NUM_THREADS=1).
+its favour. `plain` is this package's step with the transformer of
+tests/references/scene_decoder.py, made of plain layers. `products_s` is the time that the step's
+matrix products alone would take at the rate of a large product. The variants alternate, so that
+other load affects all; values are medians. On a busy machine, rely on CPU time with one thread
+(OMP_NUM_THREADS=1).
 """
 
 import argparse
@@ -177,7 +178,7 @@ if __name__ == "__main__":
     parser.add_argument("--rooms", type=int, default=128)
     parser.add_argument("--objects", type=int, default=13)
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--json", type=Path, help="write the numbers to this file, too")
+    parser.add_argument("--json", type=Path, help="also write the numbers to this file")
     options = parser.parse_args()
     print(f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, ", end="")
     print(f"torch {torch.__version__} on {torch.get_num_threads()} threads")

@@ -4,7 +4,7 @@
 
 - ids: CPU time (all threads of the process) of one view's instance ids at 480 x 360, in a room of
   12 objects with 5,120 faces each, with 20 views per call; the median of 9 calls, in which the
-  renderers take turns.
+  renderers alternate.
 - workers: wall clock of preparing the same homes with one worker and with two, whole commands. It
   is meaningless on a busy machine, so the load average is printed.
 - sens: peak memory of `prep-scannet` on a `.sens` of 1,000 frames of 1296 x 968, with payloads as
@@ -177,8 +177,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     names = ["ids", "workers", "sens"]
     parser.add_argument("--only", nargs="+", choices=names, default=names)
-    parser.add_argument("--rooms", type=int, default=240, help="rooms that the workers prepare")
-    parser.add_argument("--json", type=Path, help="write the numbers to this file, too")
+    parser.add_argument("--rooms", type=int, default=240, help="number of rooms to prepare")
+    parser.add_argument("--json", type=Path, help="also write the numbers to this file")
     arguments = parser.parse_args()
     parts: dict[str, Callable[[], dict[str, Any]]] = {
         "ids": ids,

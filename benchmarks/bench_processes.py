@@ -4,7 +4,7 @@
 
 Both stages are trained for a few epochs by `fit`, with one thread per process. Two processes share
 each batch (`batch_size` is halved), so that both variants take the same steps and end with the same
-weights; dropout, which differs between processes, is off. The variants take turns. Speed-ups are
+weights; dropout, which differs between processes, is off. The variants alternate. Speed-ups are
 medians of the ratios of neighbouring runs, in rooms per second and in steps. On a busy machine the
 ratio of CPU seconds per process bounds the speed-up on idle cores. The bytes of gradients, which
 are summed over processes at every step, and the seconds of this all-reduce are listed too.
@@ -68,7 +68,7 @@ def compare(
 
 
 def weights_off(one: Path, two: Path) -> float:
-    """The largest absolute difference of any weight between two runs at the end of a stage."""
+    """The largest absolute difference between weights of two runs at the end of a stage."""
     ends = [read_checkpoint(path / "final.ckpt")["state_dict"] for path in (one, two)]
     return max(float((ends[0][name] - ends[1][name]).abs().max()) for name in ends[0])
 
@@ -126,7 +126,7 @@ def _train(arguments: argparse.Namespace) -> None:
 
 
 def _all_reduce_s(size: int, device: torch.device, repeats: int = 20) -> float:
-    """Median seconds of an all-reduce of `size` bytes of float32 over the processes."""
+    """Median time in seconds to all-reduce `size` bytes of float32 over the processes."""
     numbers, times = torch.ones(size // 4, device=device), []
     for _ in range(repeats):
         dist.barrier()
@@ -140,13 +140,15 @@ def _all_reduce_s(size: int, device: torch.device, repeats: int = 20) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--shards", type=Path, help="view shards; without, homes are made")
-    parser.add_argument("--rooms", type=int, default=24, help="made homes")
+    parser.add_argument("--shards", type=Path, help="view shards (default: homes are made)")
+    parser.add_argument("--rooms", type=int, default=24, help="number of homes to make")
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--epochs", type=int, default=4, help="of each stage, at least 3")
+    parser.add_argument("--epochs", type=int, default=4, help="epochs of each stage, at least 3")
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--set", action="append", default=[], help="shape.silhouettes=fast")
-    parser.add_argument("--json", type=Path, help="write the numbers to this file, too")
+    parser.add_argument(
+        "--set", action="append", default=[], help="changed key, such as shape.silhouettes=fast"
+    )
+    parser.add_argument("--json", type=Path, help="also write the numbers to this file")
     parser.add_argument("--child", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--processes", type=int, help=argparse.SUPPRESS)
     arguments = parser.parse_args()

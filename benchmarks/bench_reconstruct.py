@@ -1,4 +1,4 @@
-"""Single-view reconstruction: 3D box IoU, and time per image alone and in a batch.
+"""Single-view reconstruction: 3D box IoU, and time per image, alone and in a batch.
 
 Run `python benchmarks/bench_reconstruct.py --run RUN --shards SHARDS`. The images are one view of
 each test room. The IoU is of axis-aligned boxes, with the same weight for every object; the
@@ -78,7 +78,7 @@ def main() -> None:
     torch.set_num_threads(given.threads)
     trained = load_run(given.run)
     images, _ = images_of_split(given.shards, "test", limit=given.images)
-    # A sample that is spread evenly over the numbers of objects.
+    # Take a sample that is spread evenly over the numbers of objects.
     ordered = sorted(images, key=lambda image: len(image.object_class))
     picked = ordered[:: max(1, len(images) // given.singles)]
     reconstruct(trained, picked[:1], FitOptions())

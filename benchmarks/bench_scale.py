@@ -1,16 +1,16 @@
-"""Cost of each step from data to training, and its growth with numbers of rooms and objects.
+"""Cost of each step from data to training, and its growth with the numbers of rooms and objects.
 
     python benchmarks/bench_scale.py [--rooms 500 2000 6000] [--json FILE] [--folder DIR]
 
 For each number of rooms, separate processes make bedrooms, prepare them with two workers, and
 inspect them; load every room's 20 views with masks at a quarter of the size, twice; and train a few
 steps of both stages of the paper's run (configs/paper/bedroom.yaml). For each step, the table lists
-wall clock, CPU seconds of the process and its children, peak memory of the largest of them, and the
-exponent of the growth of CPU seconds from each number of rooms to the next.
+wall clock, CPU seconds of the process and its children, peak memory of the largest process, and the
+growth exponent of CPU seconds from each number of rooms to the next.
 
 The benchmark also times a layout step of the paper's size with as many objects as bedrooms, living
 rooms and ScanNet scenes hold (128 rooms of 20 views, one thread), and extrapolates the paper's full
-schedule on this machine: number of steps times the median step.
+schedule on this machine: number of steps times median step time.
 """
 
 import argparse
@@ -28,13 +28,13 @@ from pathlib import Path
 from typing import Any
 
 EPOCHS, STEPS = 3, 1
-"""Epochs per stage, of which the first compiles and the last evaluates; and steps per epoch."""
+"""Number of epochs per stage (the first compiles, the last evaluates), and steps per epoch."""
 ROOMS, OBJECTS = 128, (13, 28, 53)
-"""Rooms of a layout step; largest numbers of objects in bedrooms, living rooms and ScanNet."""
+"""Rooms per layout step; maximum numbers of objects in bedrooms, living rooms and ScanNet."""
 
 
 def child(*words: object) -> dict[str, Any]:
-    """Run a command; returns the seconds, CPU seconds and peak memory of it and its children."""
+    """Run a command; returns its seconds, CPU seconds and peak memory, children included."""
     began = time.perf_counter()
     process = subprocess.Popen(
         [sys.executable, *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT
@@ -157,8 +157,8 @@ def _told(figures: dict[str, float]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--rooms", nargs="+", type=int, default=[500, 2000, 6000])
-    parser.add_argument("--json", type=Path, help="write the numbers to this file, too")
-    parser.add_argument("--folder", type=Path, help="keep what is made here")
+    parser.add_argument("--json", type=Path, help="also write the numbers to this file")
+    parser.add_argument("--folder", type=Path, help="folder that keeps the generated files")
     parser.add_argument("--part", nargs=2, help=argparse.SUPPRESS)  # for child processes
     arguments = parser.parse_args()
     if arguments.part:

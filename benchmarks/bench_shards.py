@@ -12,7 +12,7 @@ views with masks at a quarter of the size, read and collated by one process. The
   class, track and mask is read separately, drawn into an image, downsampled, and stacked view by
   view and room by room.
 
-The variants take turns; values are medians, ratios are within one run.
+The variants alternate; values are medians, and ratios are within one run.
 """
 
 import argparse
@@ -59,7 +59,7 @@ def sizes(shards: Path) -> dict[str, float]:
 
 
 def memory(shards: Path) -> dict[str, float]:
-    """Memory in MB that the loader needs per 100,000 such views."""
+    """Memory in MB that the loader needs per 100,000 views."""
     flat = FlatViews.of([shard.read_room(room) for shard, room in iterate_rooms(shards, "train")])
     views = len(flat.world_to_camera)
     data = ViewDataset(shards, "train", VIEWS, mask_step=STEP)
@@ -187,9 +187,9 @@ def speeds(shards: Path, folder: Path, repeats: int) -> dict[str, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--shards", type=Path, help="measure these instead of made homes")
+    parser.add_argument("--shards", type=Path, help="shards to measure (default: homes are made)")
     parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument("--json", type=Path, help="write the numbers to this file, too")
+    parser.add_argument("--json", type=Path, help="also write the numbers to this file")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     figures: dict[str, Any] = {"cores": os.cpu_count(), "load_average": os.getloadavg()}

@@ -3,9 +3,9 @@
     python benchmarks/bench_silhouettes.py [--json FILE]
 
 The script measures the exact and the fast mode on the CPU (`gpu.py` measures a GPU), the torch
-reference, the closed-form boxes, and PyTorch3D if it is installed. Values are medians of runs that
-take turns, so that other load affects all alike; ratios are between medians of one run. Compilation
-is reported separately and not included in medians.
+reference, the closed-form boxes, and PyTorch3D if it is installed. Values are medians of
+alternating runs, so that other load affects all equally; ratios are between medians of one run.
+Compilation is reported separately and not included in medians.
 """
 
 import argparse
@@ -70,7 +70,7 @@ def forward_backward(room: dict[str, Any], **options: Any) -> Callable[[], None]
 
 
 def medians(steps: dict[str, Callable[[], None]], repeats: int) -> dict[str, float]:
-    """Median seconds of each step; the steps take turns."""
+    """Median seconds of each step; the steps alternate."""
     times: dict[str, list[float]] = {name: [] for name in steps}
     for step in steps.values():
         step()
@@ -209,7 +209,7 @@ def machine() -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--json", type=Path, help="write the numbers to this file, too")
+    parser.add_argument("--json", type=Path, help="also write the numbers to this file")
     parser.add_argument("--repeats", type=int, default=15)
     arguments = parser.parse_args()
     figures: dict[str, Any] = {}

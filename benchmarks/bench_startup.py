@@ -5,7 +5,7 @@
 The commands are `help`, `import_torch` (a lower limit for the others), `synthesize` of 4 rooms and
 of many, and `view` until it prints the page's address. Values are wall-clock and CPU seconds (user
 and system), medians of 3 new processes. `synthesize_first` starts with an empty Numba cache, as
-after an installation, and compiles the kernels that draw. On a busy machine, rely on CPU seconds.
+after an installation, and compiles the rendering kernels. On a busy machine, rely on CPU seconds.
 """
 
 import argparse

@@ -2,7 +2,7 @@
 
 Run `python benchmarks/bench_threads.py`. It measures the wall clock of a layout step of the small
 configs' size (64 rooms) and of the paper's size (32 rooms), each setting in a separate process. The
-settings take turns, step by step, so that other load affects all; values are medians.
+settings alternate step by step, so that other load affects all; values are medians.
 """
 
 import argparse

@@ -44,7 +44,7 @@ def main() -> None:
     """Measure and print."""
     options = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     options.add_argument("run", help="run or prior, as for `sceneprior view`")
-    options.add_argument("--rooms", type=int, default=200, help="rooms of one round of the circle")
+    options.add_argument("--rooms", type=int, default=200, help="rooms along the circle, per round")
     options.add_argument("--json", type=Path)
     given = options.parse_args()
     measured: dict[str, Any] = {"cores": os.cpu_count(), "load": os.getloadavg()[0]}
@@ -84,7 +84,7 @@ def timed(task: Callable[[], None], rooms: int) -> dict[str, float]:
 
 
 def dragged(page: Page, points: list[tuple[float, float]]) -> dict[str, float]:
-    """Rates and delays of rooms at a client that drags over the board at a browser's rate."""
+    """Rates and delays of rooms that arrive at a client while it drags over the board."""
     assert page.board is not None, "the run has a map"
     eye = (0.0, 8.0, 10.0)
     camera = {

@@ -1,4 +1,4 @@
-"""Scores of completed rooms, compared with the nearest training room and other baselines.
+"""Scores of completed rooms, compared with nearest training rooms and other baselines.
 
     python benchmarks/complete_rooms.py --run RUN --shards SHARDS [--answers 4] [--seed 0]
 
@@ -16,7 +16,7 @@ others are hidden. The rows of the table are
 `overlaps` is the mean number of intersecting pairs of boxes, and `beds` the share of rooms with the
 furniture of their type (a bed in bedrooms). `found` is the share of given objects for which the
 room already had an object of the class, and `off_m` the mean distance between the two objects (over
-centres and sides). `differ` is the diversity of the completions of one room, a mean over pairs of
+centres and sides). `differ` is the diversity of a room's completions, a mean over pairs of
 completions. Added objects of the same class are matched, and a pair scores 1 minus the summed IoU
 of the matches divided by the larger number of added objects; 0 means equal.
 """
@@ -96,7 +96,8 @@ def half(room: Scene, rng: np.random.Generator) -> Scene:
 
 
 def nearest(training: Sequence[Scene], given: Scene) -> Scene:
-    """The training room nearest to the given objects, by the mean difference of centres and sides.
+    """The training room with the smallest mean difference of centres and sides from the given
+    objects.
 
     A missing object costs 2 m.
     """

@@ -6,12 +6,12 @@
     python benchmarks/fit_shapes.py --shards out/fit/shards --rooms 24 --steps 150 --seed 0
 
 Two fifths of the views of each room are fitted, the others are held out. A mesh starts as a sphere
-in its object's true box, moved by about 15 cm and scaled by about a quarter, and its vertices and
-box are optimised by the mask loss alone (masks at 120 x 90, the paper's sigma). All variants take
-the same steps on the same views from the same start. `lifted` uses neither true boxes nor steps:
-boxes and parts are found from full-size masks, as in `fit`. The scores are the IoU of
-each object's visible hard mask in held-out views, and the IoU of the mesh's bounding box with the
-true one. With --image-step k every k-th pixel of the masks is used along each axis.
+in its object's true box, moved by about 15 cm and scaled by about a quarter. Its vertices and box
+are optimised by the mask loss alone (masks at 120 x 90, the paper's sigma). All variants take the
+same steps on the same views from the same start. `lifted` uses neither true boxes nor steps: boxes
+and parts are found from full-size masks, as in `fit`. The scores are the IoU of each object's
+visible hard mask in held-out views, and the IoU of the mesh's bounding box with the true one. With
+--image-step k, every k-th pixel of the masks is used along each axis.
 """
 
 import argparse
@@ -92,7 +92,7 @@ def main() -> None:
 
 
 def lift_rooms(shards: Path, seed: int) -> list[list[Mesh]]:
-    """Meshes of all rooms' objects by lifting; empty for an object that no view shows."""
+    """Lifted meshes of all rooms' objects; empty for an object that no view shows."""
     with tempfile.TemporaryDirectory() as name:  # the cache next to the shards uses all views
         for each in shards.iterdir():
             if not each.name.startswith("lifted_"):

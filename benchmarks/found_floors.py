@@ -2,12 +2,12 @@
 
     python benchmarks/found_floors.py SHARDS [--split test] [--noisy] [--homes HOMES]
 
-The shards must hold stuff and 3D ground truth, as those of `prep-front` do. The error of a wall is
-the larger distance of its ends from the line of the nearest side of the true floor, and a side is
-found if walls cover half of it. `--homes` is the folder of the houses, for the true doors; a door
-is found if both ends are within 15 cm. With `--noisy`, each pose is displaced by 1 cm and 0.5
-degrees, and the outlines of masks waver by a pixel (standard deviation) of images with 240 pixels
-along the longer side.
+The shards must hold stuff and 3D ground truth, like those of `prep-front`. A wall's error is the
+larger distance of its ends from the line through the nearest true side. A true side counts as found
+if walls cover half of it. `--homes` is the folder of the houses, for the true doors; a door is
+found if both ends are within 15 cm. With `--noisy`, each pose is displaced by 1 cm and 0.5 degrees,
+and the outlines of masks are displaced by a standard deviation of one pixel in images with 240
+pixels along the longer side.
 """
 
 import argparse
@@ -40,14 +40,14 @@ class Score(NamedTuple):
     seen: float
     """Share of the true floor that some view shows."""
     beyond_m2: float
-    """Area of the seen floor outside of the true one."""
+    """Area of the seen floor outside the true floor."""
     iou: float
-    """IoU of the floor between walls with the true floor."""
+    """IoU of the true floor and the floor between the found walls."""
     iou_seen: float
     walls: int
     errors_m: tuple[float, ...]
     stated_m: tuple[float, ...]
-    """The walls' own standard errors."""
+    """Standard errors that the found walls state themselves."""
     sides: int
     sides_found: int
     doors: int
@@ -57,7 +57,7 @@ class Score(NamedTuple):
 
 
 def score(views: RoomViews, floor_m: np.ndarray, doors: list[np.ndarray]) -> Score:
-    """Find floor, walls and doors of one room, and compare them with the true ones."""
+    """Find a room's floor, walls and doors, and compare them with the ground truth."""
     start = time.process_time()
     found = find_floor(views)
     seconds = time.process_time() - start
@@ -86,8 +86,8 @@ def _iou(one: shapely.Geometry, other: shapely.Geometry) -> float:
 
 
 def _error(wall: Wall, sides: np.ndarray) -> float:
-    """Distance of a wall's ends from the line of the nearest side along its middle; infinite
-    without one."""
+    """Distance of a wall's ends from the line of the nearest true side that passes the wall's
+    middle; infinite if there is none."""
     along = sides[:, 1] - sides[:, 0]
     length = np.linalg.norm(along, axis=1)
     along /= length[:, None]

@@ -1,10 +1,10 @@
-"""How often the front that a prior gives to furniture is the true one.
+"""Accuracy of the fronts that a prior gives to furniture.
 
     python benchmarks/fronts.py PRIOR SHARDS [--split test]
 
-Objects are lifted from their masks and named by the look of the prior's prototypes that explains
-these masks best; the true yaw in the shards tells which side is the front. The table has a row for
-each class and for each range of the prior's confidence. Classes without a front are left out of the
+Objects are lifted from their masks and assigned to the posed prototype of the prior that explains
+the masks best; the true yaw in the shards defines the true front. The table has a row for each
+class and for each range of the prior's confidence. Classes without a front are left out of the
 total: lamps, tables and stools.
 """
 

@@ -65,7 +65,7 @@ def run(parts: dict[str, Part], out: Path, words: list[str]) -> dict[str, Any]:
     for name, part in parts.items():
         print(f"{name} ...", flush=True)
         start = time.monotonic()
-        end += 60 * part.minutes  # time that earlier parts left may be used too
+        end += 60 * part.minutes  # later parts may use the time that earlier parts left
         problem = run_part(name, out, words, end - start)
         rows = out / "parts" / f"{name}.jsonl"
         lines = rows.read_text().splitlines() if rows.is_file() else []
@@ -88,7 +88,7 @@ def run_part(name: str, out: Path, words: list[str], seconds: float) -> str | No
     log = folder / f"{name}.log"
     command = [sys.executable, __file__, *words, "--out", str(out), "--part", name]
     with log.open("w") as said:
-        # In a new session, so that the processes that training starts can be killed with it.
+        # The child gets a new session, so that processes started by training can be killed with it.
         child = subprocess.Popen(command, stdout=said, stderr=said, start_new_session=True)
         try:
             status = child.wait(seconds)
@@ -105,7 +105,7 @@ def run_part(name: str, out: Path, words: list[str], seconds: float) -> str | No
 
 
 def measure(name: str, device: str, sizes: Sizes, out: Path) -> None:
-    """Measure one part, in its own process."""
+    """Measure one part, in the process of that part."""
     with (out / "parts" / f"{name}.jsonl").open("a") as file:
 
         def note(what: str, figures: dict[str, float]) -> None:
@@ -151,7 +151,7 @@ def device_of(words: list[str]) -> dict[str, Any]:
 
 
 def commit() -> str:
-    """The checkout's commit, followed by `+` if files differ from it."""
+    """The checkout's commit, followed by `+` if files have been changed."""
     folder = Path(__file__).parent
     git = ["git", "-C", str(folder), "describe", "--always", "--dirty=+", "--abbrev=10"]
     try:
@@ -165,7 +165,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--out", type=Path, default=Path("out/gpu"))
     parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
-    parser.add_argument("--tiny", action="store_true", help="sizes for a trial of minutes")
+    parser.add_argument("--tiny", action="store_true", help="small sizes, for a trial of minutes")
     parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
     parser.add_argument("--part", choices=PARTS, help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)

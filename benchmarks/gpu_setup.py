@@ -47,14 +47,14 @@ TINY = Sizes(
 
 @dataclass(frozen=True)
 class Setup:
-    """Settings that a part is called with."""
+    """Settings with which a part is called."""
 
     device: str
     sizes: Sizes
     folder: Path
     """Folder shared by all parts, which keeps the homes."""
     note: Callable[[str, dict[str, float]], None]
-    """Function that writes a row of the part's table at once, from the row's title and its values
+    """Function that immediately writes a row of the part's table, from the row's title and values
     by name; names end in units."""
 
 

@@ -24,7 +24,7 @@ from sceneprior.render.silhouettes import render_scene
 from sceneprior.render.silhouettes.render import COMPOSITING, MODES
 
 SIGMA_PX2 = 0.25
-"""A sigma that float32 represents exactly, since compiled kernels round it to float32."""
+"""A sigma that float32 represents exactly, since compiled kernels round sigma to float32."""
 
 
 def kernels(setup: Setup) -> None:

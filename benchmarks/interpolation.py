@@ -1,15 +1,15 @@
-"""Paths between rooms: the moves of their objects, their shapes' changes, and the rooms between.
+"""Paths between rooms: moves of objects, changes of shapes, and quality of the rooms in between.
 
     python benchmarks/interpolation.py RUN [--shards FOLDER] [--paths 100] [--steps 33] [--seed 0]
 
 Paths lead between random pairs of training rooms (if the prior keeps their latents), and between
-random points of the latent space. The first table counts jumps between consecutive steps, per
-object: a move of its centre above three times the median of its path, or of its own moves; objects
-that appear, disappear or change their class are counted separately. It also counts changes of shape
-(Chamfer distance of the two meshes in the room, `--shapes` paths) above three times the object's
-median: as the prior decodes each step, and as `interpolate` blends shapes. The second table judges
-the rooms at five places from the start to the middle, one room of each path at each place: by
-symmetry, the other half of a path is no different.
+random points of the latent space. The first table counts jumps of objects between consecutive
+steps: moves of an object's centre above three times the median of the path, or of the object's
+moves. Objects that appear, disappear or change their class are counted separately. The table also
+counts changes of shape (Chamfer distance of the two meshes in the room, `--shapes` paths) above
+three times the object's median, both as the prior decodes each step and as `interpolate` blends
+shapes. The second table evaluates rooms at five places from the start to the middle, one room of
+each path per place; by symmetry, the other half of a path is no different.
 """
 
 import argparse
@@ -37,10 +37,10 @@ from sceneprior.paper.sampling import sample_latents
 from sceneprior.paper.trained import TrainedPrior
 
 JUMP = 3.0
-"""A jump is a step above this many medians."""
+"""A jump is a step of more than this multiple of the median."""
 PLACES = (0.0, 0.125, 0.25, 0.375, 0.5)
 POINTS = 50
-"""Points of a mesh whose distances to the other mesh's triangles are averaged."""
+"""Number of points per mesh whose distances to the other mesh are averaged."""
 
 
 def main() -> None:
@@ -77,7 +77,7 @@ def main() -> None:
 
 
 def tell(**row: Any) -> None:
-    """Print a row, with figures to three decimals."""
+    """Print a row, with numbers rounded to three decimals."""
     print(
         json.dumps({k: round(v, 3) if isinstance(v, float) else v for k, v in row.items()}),
         flush=True,
@@ -96,8 +96,8 @@ def paths_of(trained: TrainedPrior, count: int, seed: int) -> dict[str, list[Roo
 
 
 def moves(paths: Sequence[RoomPath], steps: int) -> dict[str, Any]:
-    """Jumps of objects' centres per step; objects that come or go, and changes of class, per
-    path."""
+    """Jumps of objects' centres per step; appearing and disappearing objects, and changes of class,
+    per path."""
     of_path, of_object, moved = [], [], []
     come = gone = relabelled = 0
     for path in paths:
@@ -128,10 +128,10 @@ def moves(paths: Sequence[RoomPath], steps: int) -> dict[str, Any]:
 
 
 def changes(paths: Sequence[RoomPath], steps: int) -> dict[str, Any]:
-    """Changes of shape per step, as decoded and as blended, and how far the two are apart.
+    """Changes of shape per step, as decoded and as blended, and the distance between the two.
 
-    `jumps` and `median_cm` are of meshes in the room, whose boxes move; `alone_99%_cm` is of shapes
-    alone, with both meshes in one box.
+    `jumps` and `median_cm` are for meshes in the room, whose boxes move; `alone_99%_cm` is for
+    shapes alone, with both meshes in the same box.
     """
     moved: dict[str, list[np.ndarray]] = {"decoded": [], "blended": []}
     alone: dict[str, list[float]] = {"decoded": [], "blended": []}
@@ -164,7 +164,7 @@ def changes(paths: Sequence[RoomPath], steps: int) -> dict[str, Any]:
 
 
 def item_of(room: DecodedRoom, slot: int) -> SceneObject:
-    """The object of a prediction."""
+    """The object of prediction `slot`."""
     return room.scene.objects[room.predictions.index(slot)]
 
 
@@ -179,7 +179,7 @@ def chamfer_m(one: SceneObject, other: SceneObject) -> float:
 
 
 def apart_m(a: Mesh, b: Mesh) -> np.ndarray:
-    """Distances of points on a mesh to the nearest point of another."""
+    """Distances from points on mesh a to the nearest points of mesh b."""
     points = surface_points(a.vertices_m, a.faces, POINTS)
     corners = np.asarray(b.vertices_m, dtype=np.float64)[b.faces]
     nearest = trimesh.triangles.closest_point(
@@ -189,7 +189,7 @@ def apart_m(a: Mesh, b: Mesh) -> np.ndarray:
 
 
 def judged(rooms: Sequence[Scene], real: Sequence[Scene], test: Sequence[Scene]) -> dict[str, Any]:
-    """Yardsticks of a set of rooms (docs/evaluation.md), without intervals."""
+    """Metrics of a set of rooms (docs/evaluation.md), without intervals."""
     plausible, pairs = plausible_pairs(real), map(room_overlaps, rooms)
     implausible = [(each.intersect & ~plausible[tuple(each.classes.T)]).sum() for each in pairs]
     return {

@@ -3,7 +3,7 @@
     python benchmarks/nearest_rooms.py RUN --sheet sheet.png [--distribution paper]
 
 The picture has 24 pairs, with the sampled room on the left; the mean layout distance is printed.
-Memorised training rooms show as pairs of equal rooms.
+Memorised training rooms appear as pairs of equal rooms.
 """
 
 import argparse
@@ -26,8 +26,8 @@ def main() -> None:
     """Write the picture, and print the distance."""
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("run", type=Path)
-    options.add_argument("--sheet", type=Path, required=True, help="where the picture goes (PNG)")
-    options.add_argument("--distribution", help="of the rooms (default: the run's)")
+    options.add_argument("--sheet", type=Path, required=True, help="file of the picture (PNG)")
+    options.add_argument("--distribution", help="distribution of the rooms (default: the run's)")
     options.add_argument("--seed", type=int, default=0)
     given = options.parse_args()
     trained = load_any_run(given.run)

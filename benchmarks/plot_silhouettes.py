@@ -51,7 +51,7 @@ def disc(level: int, mode: str, radius_px: float) -> tuple[np.ndarray, np.ndarra
 
 
 def plot_profiles(path: Path) -> None:
-    """Plot coverage, and its derivative by the radius, across the outline of a sphere."""
+    """Plot coverage, and its derivative with respect to the radius, across a sphere's outline."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.5, 3.4), layout="constrained")
     for mode, line in (("exact", "-"), ("fast", "--")):
         for level, color in ((2, "tab:blue"), (3, "tab:orange"), (4, "tab:green")):

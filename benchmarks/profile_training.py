@@ -1,13 +1,13 @@
-"""Profile of training steps: the time of every part of a step, for each stage of a run.
+"""Profile of training steps: time spent in each part of a step, for each stage of a run.
 
     python benchmarks/profile_training.py [CONFIG ...] [--threads 1 2] [--steps 20] [--shards DIR]
 
 The script trains a few steps of every stage of shipped configs by `fit`, with their batch sizes, on
 64 bedrooms that are made and prepared first, unless `--shards` is given. Lifting before the first
-stage takes minutes, once per folder. Values are medians in milliseconds over the steps, without the
-first ones, in which kernels compile: CPU time of all threads, which other load affects little, and
-the wall clock of the whole step. `rest` is the time outside all parts below: latents, the end of an
-epoch with its checkpoint and logs, and Lightning itself.
+stage takes minutes, once per folder. Values are medians in milliseconds over the steps, except the
+first, in which kernels compile: CPU time of all threads, which other load affects little, and wall
+clock of the whole step. `rest` is the time outside all parts below: latents, the end of an epoch
+with its checkpoint and logs, and Lightning itself.
 """
 
 import argparse
@@ -52,7 +52,7 @@ PARTS = {
 LIGHTNING = {
     "train_dataloader_next": "data", ".backward": "backward", ".optimizer_step": "optimiser",
 }  # fmt: skip
-"""Suffixes of the names of Lightning's actions, and the parts that they count as."""
+"""Suffixes of names of Lightning's actions, each with the part that its time is added to."""
 SHOWN = ("data", *PARTS, "backward", "optimiser", "rest")
 
 
@@ -116,7 +116,7 @@ def profile(name: str, shards: Path, run: Path, threads: int, steps: int) -> lis
     """Train a few steps of each stage; returns the medians in ms by stage and part."""
     changes = [f"data.shards={shards}", "data.workers=0"]
     for stage in load_config(name).stages():
-        # Enough epochs of 64 rooms for all steps.
+        # Train enough epochs of 64 rooms for all steps.
         epochs = -(-(steps + WARM_UP) // max(64 // stage.settings.batch_size, 1))
         changes += [f"{stage.name}.epochs={epochs}", f"{stage.name}.cpu_threads={threads}"]
     numba.config.NUMBA_NUM_THREADS = threads  # type: ignore[attr-defined]
@@ -132,7 +132,7 @@ def profile(name: str, shards: Path, run: Path, threads: int, steps: int) -> lis
 
 
 def medians_ms(steps: list[dict[str, float]]) -> dict[str, float]:
-    """Median ms of each part, of all parts together (CPU) and of the wall clock."""
+    """Median ms per part, for all parts together (CPU), and by the wall clock."""
     found = {part: statistics.median(step[part] for step in steps) for part in SHOWN}
     found["CPU"] = statistics.median(sum(step.values()) - step["clock"] for step in steps)
     found["clock"] = statistics.median(step["clock"] for step in steps)

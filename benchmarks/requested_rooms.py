@@ -1,19 +1,19 @@
-"""Rooms sampled for requests that are made from test rooms: wishes met, plausibility, and time.
+"""Rooms sampled for requests that are made from test rooms: fulfilled wishes, plausibility, time.
 
     python benchmarks/requested_rooms.py --run procthor-bedroom --shards SHARDS [--doors] [--seed 0]
 
-Each request has the floor of a test room, half of the room's objects (rounded up) as the least
-number of each class, and two relations that hold between these objects, drawn by --seed from those
-of `sceneprior/lifted/requests/relations.py`: so the test room itself meets the request. Fronts are
-the true ones; objects of a class without a front have no relations that need it. With --doors, a
-request also has a door and a window at random places. One room is sampled for each request. Test
-rooms are reused with other halves until there are --requests requests. Objects of classes that the
-prior does not draw are ignored.
+Each request has the floor of a test room, half of the room's objects (rounded up) as the minimum
+number of each class, and two relations of `sceneprior/lifted/requests/relations.py`, drawn by
+--seed from those that hold between these objects. So the test room itself meets the request. Fronts
+are those of the ground truth; objects of a class without a front have no relations that need a
+front. With --doors, a request also has a door and a window at random places. One room is sampled
+for each request. Test rooms are reused with other halves until there are --requests requests.
+Objects of classes that the prior does not draw are ignored.
 
-`met` is the number of counts and relations that hold. `classifier` is the accuracy of the
-layout classifier (docs/evaluation.md) between requested and real rooms, and `unconditioned` its
-accuracy between as many rooms without a request and real ones; 0.5 is best. `seconds` is the CPU
-time per room, including meshes, after one room to warm up.
+`met` is the number of fulfilled counts and relations. `classifier` is the accuracy of the layout
+classifier (docs/evaluation.md) between requested and real rooms, and `unconditioned` its accuracy
+between equally many rooms without a request and real rooms; 0.5 is best. `seconds` is the CPU time
+per room, including meshes, after one room to warm up.
 """
 
 import argparse
@@ -43,7 +43,7 @@ from sceneprior.lifted.requests.shape import RoomShape
 from sceneprior.lifted.requests.wishes import RelationWish
 
 RELATIONS = 2
-"""Relations of a request."""
+"""Number of relations per request."""
 BY_FRONT_OF_TARGET = ("beside", "in front of")
 BY_FRONT_OF_SUBJECT = ("facing",)
 
@@ -97,8 +97,7 @@ def main() -> None:
 
 
 def fronts_of(shards: Path, split: str) -> list[np.ndarray]:
-    """The side of the true front of each object of `reference_scenes`, numbered as in
-    `Furniture`."""
+    """The true front side of each object of `reference_scenes`, numbered as in `Furniture`."""
     fronts = []
     for shard, room_id in iterate_rooms(shards, split):
         truth = shard.read_ground_truth(room_id)
@@ -116,8 +115,8 @@ def requests_of(
     doors: bool,
     rng: np.random.Generator,
 ) -> list[dict[str, Any]]:
-    """Arguments of `Prior.sample` for requests made from test rooms, whose objects have these
-    fronts."""
+    """Arguments of `Prior.sample` for requests made from test rooms with the given fronts of
+    objects."""
     trained: Any = prior.trained
     known = {prior.classes[row] for row in trained.sampler.drawn_classes}
     requests: list[dict[str, Any]] = []
@@ -147,7 +146,7 @@ def requests_of(
 def relations_of(
     floor_m: np.ndarray, half: Sequence[SceneObject], front: np.ndarray, classes: tuple[str, ...]
 ) -> list[RelationWish]:
-    """Relations between these objects that hold in their room."""
+    """Relations that hold between the given objects in their room."""
     labels = sorted({item.label for item in half})
     wishes = [RelationWish(label, relation) for label in labels for relation in TO_ROOM]
     wishes += [

@@ -1,9 +1,9 @@
-"""Robustness to noise: scores after training on corrupted masks and poses, and on clean ones.
+"""Robustness to noise: scores after training on clean and on corrupted masks and poses.
 
 Run `python benchmarks/robustness.py --shards DIR [--seeds 0 1]`. The observations of the training
 split are corrupted in memory, by the same noise in every row of a seed; the 3D ground truth of the
-scores stays unchanged. Each row trains the layout stage alone, from the same initialisation and for
-the same number of steps, on rooms of at most four objects, for which a step is fast.
+scores stays unchanged. Each row trains only the layout stage, from the same initialisation and for
+the same number of steps, on rooms of at most four objects, for which steps are fast.
 """
 
 import argparse
@@ -40,9 +40,9 @@ SETTINGS = (
     "layout.latent_noise=0.04",
 )
 WRONG = 0.2
-"""Share of observations with a wrong mask; another share of the same size is dropped."""
+"""Share of observations with a wrong mask; an equal share is dropped."""
 DEGREES, METRES = 2.0, 0.05
-"""Root mean square rotation and translation of the cameras."""
+"""Root mean square rotation and translation of the noise on cameras."""
 
 
 def spoil_masks(flat: FlatViews, seed: int) -> FlatViews:

@@ -2,16 +2,16 @@
 
     python benchmarks/rooms_needed.py OUT [--sizes 150 500 1500] [--seed 0]
 
-For each size, this makes homes, prepares views, and trains `configs/demo.yaml` on the lifted boxes
-and shapes of as many training rooms, always for the same number of steps. Homes of all sizes come
-from one seed, so the rooms of a smaller set are among those of a larger one. All priors are judged
-on the test rooms of the largest set, and the layout classifier learns from that set's training and
-val rooms: 0.5 is best. `relations` is the Wasserstein distance of gaps between classes in metres.
-Both are printed for the sampler, for rooms from anywhere on the sphere (`paper`), for training
-rooms decoded from their own latents, and for real training rooms. CPU minutes are those of `fit`,
-lifting included, and of preparation.
+For each size, the script makes homes, prepares views, and trains `configs/demo.yaml` on the lifted
+boxes and shapes of that many training rooms, always for the same number of steps. All sets come
+from one seed, so larger sets include the rooms of smaller sets. All priors are evaluated on the
+test rooms of the largest set, and the layout classifier is trained on that set's training and val
+rooms; an accuracy of 0.5 is best. `relations` is the Wasserstein distance of gaps between classes
+in metres. Both metrics are printed for rooms of the sampler, for rooms from anywhere on the sphere
+(`paper`), for decoded training rooms, and for real training rooms. CPU minutes are those of `fit`
+(lifting included) and of preparation.
 
-Steps that have their result in OUT are not repeated.
+Steps whose results are in OUT are not repeated.
 """
 
 import argparse
@@ -124,7 +124,7 @@ def command(*words: str | Path) -> float:
 
 
 def scenes_of(shards: Path, split: str) -> list[Scene]:
-    """True boxes of a split's rooms."""
+    """The rooms of a split with their true boxes."""
     return list(reference_scenes(shards, split, meshes=False))
 
 

@@ -6,9 +6,9 @@ ellipsoids (the paper's proxy) and as boxes (in a run of one stage, that stage's
 final meshes. Objects are matched by boxes (`match_scenes`), each object has the same weight, and
 points are sampled with a fixed seed. Two more tables list the distance and the IoU by class.
 
-Two rows are limits: the true solids, scaled into the decoded boxes, show the best shape that
-outside views could give; the true surfaces, sampled again, show the distance that remains between
-two samples of one surface.
+Two rows are limits: the true solids, scaled into the decoded boxes, are the best shape that outside
+views could give; the true surfaces, sampled again, give the distance between two samples of the
+same surface.
 """
 
 import argparse
@@ -62,7 +62,7 @@ def own(item: SceneObject, _: SceneObject) -> Mesh:
 
 
 class Fidelity(NamedTuple):
-    """Scores of one object's shape against the true one."""
+    """Scores of one object's shape against the true shape."""
 
     label: str
     """The true class."""
@@ -134,9 +134,8 @@ def distances(
 
 
 def figures(pairs: list[tuple[Scene, Scene]], shards: Path) -> dict[str, float | None]:
-    """3D box IoU of decoded training rooms, and Frechet distances to the test rooms.
-
-    The distances, in EfficientNet-Lite0 features, are of the decoded and the true training rooms.
+    """3D box IoU of decoded training rooms, and Frechet distances to the test rooms, in
+    EfficientNet-Lite0 features, from the decoded and from the true training rooms.
     """
     options = EvalOptions(resamples=0)
     scores = evaluate_synthesis([decoded for decoded, _ in pairs], shards, options)

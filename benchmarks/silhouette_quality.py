@@ -5,7 +5,7 @@
 
 Every variant starts from the same layout checkpoint and trains on the same batches. The decoded
 training rooms are then rasterised without softness. Each object's visible mask is compared with the
-observed one (mask IoU, mean over objects and views), and its 3D box with the true box (mean over
+observed mask (mask IoU, mean over objects and views), and its 3D box with the true box (mean over
 objects).
 """
 

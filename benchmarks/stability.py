@@ -1,4 +1,4 @@
-"""Share of furniture that stays where it is in MuJoCo, as generated and after `stand`.
+"""Share of furniture that does not move in MuJoCo, as generated and after `stand`.
 
 python benchmarks/stability.py procthor-bedroom procthor-living demo-bedroom --count 40 --seed 1
 """

@@ -86,7 +86,7 @@ class StageTimes:
         return statistics.median(step for epoch in self.steps_s[1:-1] for step in epoch)
 
     def figures(self) -> dict[str, float]:
-        """The values of a table's row."""
+        """The values of a table row, by name."""
         waiting = self.epoch_s - self.step_s * len(self.steps_s[1])
         return {
             "step_s": self.step_s,
@@ -103,7 +103,7 @@ StageEnded = Callable[[str, StageTimes], None]
 
 
 class Clock(Callback):
-    """Times every step and epoch of each stage, separately in each process."""
+    """Measures every step and epoch of each stage, separately in each process."""
 
     def __init__(self, matmul: str, ended: StageEnded) -> None:
         self.matmul, self.ended = matmul, ended

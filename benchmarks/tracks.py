@@ -1,7 +1,7 @@
-"""Accuracy of the objects found from masks whose ids are not consistent across frames.
+"""Accuracy of objects found from masks whose ids are inconsistent across frames.
 
 Run `python benchmarks/tracks.py SHARDS ... [--noise clean noisy]`. The shards must hold 3D ground
-truth, as those of `make-homes` with `prep-front` do. Every frame gets new random ids. The noise,
+truth, like those of `make-homes` and `prep-front`. Every frame gets new random ids. The noise,
 drawn by the seed, removes 10% of the masks, merges 5% with the nearest mask of the same view, cuts
 5% in two, gives 5% the class of another object, and displaces each pose by 1 cm and 0.5 degrees;
 other names of `NOISES` are parts of it.
@@ -115,7 +115,7 @@ def _numbers(image: np.ndarray, void: int) -> list[int]:
 
 
 def moved(pose: np.ndarray, noise: Noise, rng: np.random.Generator) -> np.ndarray:
-    """A camera turned about a random axis and moved in a random direction."""
+    """The camera, rotated about a random axis and moved in a random direction."""
     axis, way = (vector / np.linalg.norm(vector) for vector in rng.normal(size=(2, 3)))
     cross = np.cross(np.eye(3), axis)
     angle = np.radians(noise.degrees)
@@ -133,9 +133,9 @@ class Score(NamedTuple):
     found: int
     true: int
     iou: float
-    """Mean 3D IoU of the lifted boxes of the objects found with the true boxes."""
+    """Mean 3D IoU of true boxes with the lifted boxes of the objects found."""
     iou_true_ids: float
-    """The same with ideal ids: each mask gets the id of the object with most of its pixels."""
+    """`iou` with ideal ids: each mask gets the id of the object with most of its pixels."""
     seconds: float
 
 
@@ -160,7 +160,7 @@ def score(views: RoomViews, truth: RoomGroundTruth, noise: Noise, seed: int) -> 
 
 
 def ideal_ids(ids: np.ndarray, views: RoomViews) -> np.ndarray:
-    """Images in which each mask of `shuffled` has the id of the true object with most of its
+    """Images in which each mask of `shuffled` has the id of the true object with most of the mask's
     pixels."""
     assert views.instance_ids is not None
     true, count = views.instance_ids.astype(np.int64), len(views.object_class)
@@ -197,7 +197,8 @@ def _boxes(
 
 
 def _mean_iou(centers: np.ndarray, sizes: np.ndarray, truth: RoomGroundTruth, count: int) -> float:
-    """Mean IoU of the true tracked objects with the boxes assigned to them; 0 without one."""
+    """Mean IoU of the true tracked objects with their assigned boxes; 0 for objects without a
+    box."""
     near = truth.centers_m[:count], truth.sizes_m[:count]
     iou = box_iou_3d(centers, sizes, *near)
     return float(iou[linear_sum_assignment(-iou)].sum() / count)
@@ -206,7 +207,7 @@ def _mean_iou(centers: np.ndarray, sizes: np.ndarray, truth: RoomGroundTruth, co
 def rooms(
     folder: Path, split: str, first: int, count: int
 ) -> Iterator[tuple[RoomViews, RoomGroundTruth]]:
-    """Some rooms of a split, in the order of the shards."""
+    """`count` rooms of a split from room `first` on, in the order of the shards."""
     place = 0
     for path in list_shards(folder, split):
         with Shard(path) as shard:

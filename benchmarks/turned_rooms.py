@@ -1,9 +1,9 @@
-"""Error of the direction found in turned rooms, and the IoU of boxes lifted with and without it.
+"""Error of the direction found in rotated rooms, and IoU of boxes lifted with and without it.
 
 Run `python benchmarks/turned_rooms.py SHARDS ... [--noise 0 1]`. The shards must hold 3D ground
-truth in rooms whose walls lie along the axes, as those of `prep-front` do. Each room is turned by a
-random angle; the noise is that of tracks.py, with the ids of the true objects. `--pieces` measures
-furniture at an angle to the walls instead.
+truth in rooms whose walls are aligned with the axes, like those of `prep-front`. Each room is
+turned by a random angle; the noise is the same as in tracks.py, but ids are those of the true
+objects. `--pieces` measures furniture at an angle to the walls instead.
 """
 
 import argparse
@@ -25,7 +25,7 @@ from sceneprior.lifted.lifting.boxes import lift_boxes
 
 CORNERS = np.array([(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)])
 OFF_DEG = 10.0
-"""Angle with both axes from which on a piece counts as turned."""
+"""Minimum angle to both axes at which a piece counts as turned."""
 
 
 def iou_upright(
@@ -47,7 +47,7 @@ def iou_upright(
 
 
 def turned(views: RoomViews, degrees: float) -> RoomViews:
-    """The same views of a room that is turned about +y."""
+    """The views, with the room turned about +y."""
     inverse = np.linalg.inv(turn_matrix(degrees))
     return replace(views, world_to_camera=(views.world_to_camera @ inverse).astype(np.float32))
 
@@ -65,7 +65,7 @@ def given(views: RoomViews, noisy: bool, seed: int) -> tuple[RoomViews, np.ndarr
 def lifted_iou(
     views: RoomViews, truth: RoomGroundTruth, rows: np.ndarray, yaw: float
 ) -> np.ndarray:
-    """IoU of boxes lifted in a turned room with the true boxes, turned by the yaw."""
+    """IoU of boxes lifted in a turned room with the true boxes, which are turned by `yaw`."""
     boxes, count = lift_boxes(views), len(rows)
     true = truth.centers_m[rows] @ yaw_rotation(yaw).T, truth.sizes_m[rows], np.full(count, yaw)
     return iou_upright(boxes.centers_m, boxes.sizes_m, np.zeros(count), true)
@@ -74,9 +74,9 @@ def lifted_iou(
 def score(
     views: RoomViews, truth: RoomGroundTruth, noisy: bool, lifts: bool, seed: int
 ) -> list[float]:
-    """Error in degrees by the masks of furniture, and by those of walls, too; NaN if no direction
-    is found. Mean IoU of lifted boxes: of the unturned room, of the turned one, and of the one that
-    is turned back; NaN unless `lifts`."""
+    """Errors in degrees from the masks of furniture, and from those of furniture and walls; NaN if
+    no direction is found. Then, the mean IoU of boxes lifted in the unturned room, in the turned
+    room, and in the room turned back by the direction found; NaN unless `lifts`."""
     made, rows = given(views, noisy, seed)
     angle = np.random.default_rng(seed).uniform(-45, 45)
     capture = turned(made, angle)
@@ -94,8 +94,8 @@ def score(
 def pieces(
     folder: Path, some: Iterable[tuple[RoomViews, RoomGroundTruth]]
 ) -> Iterator[tuple[float, ...]]:
-    """Of each tracked piece: its angle with the nearest axis in degrees; IoU of its own box, in its
-    yaw, with its true axis-aligned box, with its lifted box, and with the box lifted in its yaw."""
+    """For each tracked piece, the angle to the nearest axis in degrees, and the IoU of its oriented
+    box with its true axis-aligned box, with its lifted box, and with the box lifted at its yaw."""
     for views, truth in some:
         count = len(views.object_class)
         aligned = lift_boxes(views)
@@ -128,7 +128,9 @@ def main() -> None:
     parser.add_argument("--rooms", type=int, default=24)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
     parser.add_argument("--noise", type=int, nargs="+", default=[0, 1])
-    parser.add_argument("--lifted", type=int, default=12, help="lift the first so many rooms")
+    parser.add_argument(
+        "--lifted", type=int, default=12, help="number of rooms in which boxes are lifted"
+    )
     parser.add_argument("--pieces", action="store_true")
     options = parser.parse_args()
     for folder in options.shards:

@@ -111,7 +111,7 @@ def prep_front(
 def recipe(
     name: Annotated[str, typer.Argument(help="bedroom, living, dining, library, kitchen, all.")],
 ) -> None:
-    """Print a recipe of prep-front, to start one of your own: recipe bedroom > mine.yaml."""
+    """Print a recipe of prep-front, as a template for your own: recipe bedroom > mine.yaml."""
     from data_prep.front.recipe import recipe_text
 
     typer.echo(recipe_text(name), nl=False)
@@ -143,7 +143,7 @@ def prep_scannet(
     only: Annotated[str | None, typer.Option(help="A scan, or a prefix of scans' names.")] = None,
     retry_failed: RetryOption = False,
 ) -> None:
-    """Turn ScanNet's recordings into view shards, straight from .sens and the zips.
+    """Turn ScanNet's recordings into view shards, directly from .sens files and zips.
 
     Exit status: 0, or 3 if scans failed (the others are prepared; report.csv says why).
     """

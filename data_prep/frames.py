@@ -11,7 +11,7 @@ _ROTATION_SLACK = 1e-2
 """Largest deviation of R^T R from the identity in a valid pose. The fused poses of ScanNet's
 release, rounded to float32, deviate a thousand times less."""
 _FARTHEST = 1e9
-"""Upper bound on the absolute value of a pose's entries, in any unit; NaN fails it, too."""
+"""Upper bound on the absolute value of a pose's entries, in any unit; NaN also fails."""
 _ASPECT_SLACK = 0.02
 """Largest relative difference between the aspect ratios of masks and colour frames; 1296 x 968
 and 640 x 480 differ by 0.4% and show the same picture."""
@@ -167,7 +167,7 @@ def mask_intrinsics(
     Colour frames, masks and stored images may all differ in size; only this function converts
     between them. Two steps, each exact:
 
-    - Masks and colour frames show the same picture: u scales with the widths, v with the heights.
+    - Masks and colour frames show the same picture: u scales with the width, v with the height.
     - A downsampled pixel copies one mask pixel, whose centre may be off its own: keeping every
       fourth row from the third on shifts the image by 0.5 full-size pixels. The principal point
       moves by the mean offset, so that points project onto the pixels that show them.

@@ -1,9 +1,10 @@
-"""Finds the direction of a room's walls and furniture from images of ids, and turns the room by it.
+"""Finds the direction of a room's walls and furniture from images of ids, to align it with the
+axes.
 
 Most edges of walls and furniture are vertical, or run along one of two horizontal directions at
-right angles. The edge of a mask and the camera's centre span a plane, which holds one horizontal
-direction only. So each pixel of an outline votes for that direction, modulo 90 degrees, and the
-most frequent direction is the room's. Depths, the floor and 3D boxes are not needed.
+right angles. A mask's edge and the camera's centre span a plane, which contains only one horizontal
+direction. So each pixel of an outline votes for that direction, modulo 90 degrees, and the most
+frequent direction is the room's. Depths, the floor and 3D boxes are not needed.
 """
 
 from typing import Any, NamedTuple
@@ -16,27 +17,26 @@ from sceneprior.core.geometry.turns import yaw_rotation
 from sceneprior.core.shards import RoomViews, stuff_step, thinned, thinned_intrinsics
 
 ALIGNED_DEG = 1.0
-"""A room whose direction is at most this far from an axis is not turned."""
+"""Maximum angle between a room's direction and an axis at which the room is not turned."""
 SECOND = 0.7
-"""Highest share of the votes of the first direction that a second one may have."""
+"""Maximum votes of a second direction, as a share of the first direction's votes."""
 AGREE_DEG = 2.0
-"""Largest difference between the direction found in all views and that in either half of them."""
+"""Maximum difference between the direction found in all views and in either half of the views."""
 _SIDE_PX = 480
 """Approximate longer side of the images whose outlines are used."""
 _VIEWS = 60
 """Maximum number of views that are used, spread evenly."""
 _SMOOTH_PX = 4.0
-"""Standard deviation of the Gaussian that smooths a mask before its outline's direction is taken.
-"""
+"""Standard deviation of the Gaussian that smooths a mask before edge directions are computed."""
 _LEAST_SLOPE = 0.1
-"""Least share of the up axis in the unit normal of the plane of an edge, which may otherwise be a
-vertical edge."""
+"""Minimum vertical component of the unit normal of an edge's plane; below it, the edge may be
+vertical."""
 _MOST_CHANGE = 4.0
-"""Change of the direction with that of the edge in the image above which an edge is not used: a
-direction cannot be seen from its own height."""
+"""Maximum derivative of the voted direction with respect to the edge's direction in the image. It
+is large for edges near the camera's height, from which no direction can be determined."""
 _BINS, _WIDTH_DEG, _NEAR_DEG, _APART_DEG = 360, 0.75, 2.0, 5.0
-"""Bins of a quarter turn; standard deviation by which votes are spread; largest distance of votes
-that are averaged; smallest distance of a second direction."""
+"""Number of bins in a quarter turn; standard deviation by which votes are spread; maximum distance
+of votes that are averaged; minimum distance of a second direction."""
 _QUARTER = np.pi / 2
 
 
@@ -48,7 +48,7 @@ class _Votes(NamedTuple):
     view: Int[np.ndarray, " votes"]
 
     def half(self, which: int) -> "_Votes":
-        """Votes of every other view."""
+        """Votes of every second view, starting at view `which`."""
         return _Votes(*(part[self.view % 2 == which] for part in self))
 
 
@@ -56,9 +56,9 @@ def find_turn(views: RoomViews) -> float | None:
     """Find the angle in degrees by which a room must turn about +y, so that most of its edges run
     along x and z: from -45 to 45, 0 for a room that is aligned to `ALIGNED_DEG`.
 
-    The room was read with its images, and y points up. None if no direction is found with
-    confidence: too few edges, two directions, or other directions in other views. The angle is
-    rounded to 0.01 degrees, so that it does not depend on the last bits of sums.
+    `views` must include the images of ids; y points up. None if the direction is uncertain: too few
+    edges, two directions, or different directions in different views. The angle is rounded to 0.01
+    degrees, so that it does not depend on the last bits of sums.
     """
     votes = _votes_of_room(views)
     whole, *halves = (_most_voted(part) for part in (votes, votes.half(0), votes.half(1)))
@@ -79,19 +79,19 @@ def turn_matrix(degrees: float) -> Float[np.ndarray, "4 4"]:
 
 
 def note_of_turn(degrees: float | None) -> list[str]:
-    """Note for the report on the result of `find_turn`; none for a room that is aligned."""
+    """Note for the report on the result of `find_turn`; empty for a room that is aligned."""
     if degrees is None:
         return ["no direction of walls or furniture is found, so the room is not turned"]
     return [f"turned by {degrees:.2f} degrees, along its walls and furniture"] if degrees else []
 
 
 def _folded(yaw_rad: Any) -> Any:
-    """The angle from -45 to 45 degrees that differs by whole quarter turns."""
+    """Reduce an angle to -45 to 45 degrees by adding whole quarter turns."""
     return (yaw_rad + _QUARTER / 2) % _QUARTER - _QUARTER / 2
 
 
 def _votes_of_room(views: RoomViews) -> _Votes:
-    """Votes of the outlines of objects, void included, and of stuff, in evenly spread views."""
+    """Votes of the outlines of objects (void included) and stuff, in evenly spread views."""
     assert views.instance_ids is not None, "read with images"
     count = len(views.world_to_camera)
     rows = np.unique(np.linspace(0, count - 1, min(count, _VIEWS)).round().astype(int))
@@ -117,9 +117,9 @@ def _votes_of_image(
     """Votes of the outlines in one image of ids.
 
     An edge through (u, v) with the normal (g, h) in the image lies in the plane through the camera
-    whose normal is N = R^T K^T (g, h, -g u - h v). The horizontal directions in this plane and
-    across it, cross(N, y) and (N_x, 0, N_z), are at right angles, so the yaw of the second is voted
-    for.
+    whose normal is N = R^T K^T (g, h, -g u - h v). The horizontal directions within this plane,
+    cross(N, y), and across it, (N_x, 0, N_z), are at right angles, so that the yaw of the second
+    can be voted for.
     """
     height, width = image.shape
     margin = int(3 * _SMOOTH_PX)
@@ -137,12 +137,12 @@ def _votes_of_image(
             for order in ((0, 1), (1, 0))
         )
         u, v = x + columns.start + 0.5, y + rows.start + 0.5
-        # The image's border is no edge; and where a mask is narrow, its two sides blur into one.
+        # The image border is not an edge, and the two sides of a narrow mask blur into one.
         inner = (np.minimum(u, width - u) > margin) & (np.minimum(v, height - v) > margin)
         inner &= np.hypot(g, h) > 0.5 / (_SMOOTH_PX * np.sqrt(2 * np.pi))
         g, h, u, v = (values[inner].astype(np.float64) for values in (g, h, u, v))
         normal = np.stack([g, h, -g * u - h * v], axis=1) @ to_world
-        # The change of the normal as the edge is turned about its pixel.
+        # Derivative of the normal as the edge rotates about its pixel.
         change = np.stack([-h, g, h * u - g * v], axis=1) @ to_world
         level = np.maximum(normal[:, 0] ** 2 + normal[:, 2] ** 2, 1e-12)
         speed = np.abs(change[:, 0] * normal[:, 2] - change[:, 2] * normal[:, 0]) / level
@@ -155,14 +155,14 @@ def _votes_of_image(
 
 
 class _Direction(NamedTuple):
-    """The most frequent direction, and the share of its votes that a second one has."""
+    """The most frequent direction, and the votes of the second as a share of the first's."""
 
     yaw_rad: float
     second: float
 
 
 def _most_voted(votes: _Votes) -> _Direction | None:
-    """Find the direction with most votes near it, and average these; None without votes."""
+    """Average the votes near the most frequent direction; None without votes."""
     if not len(votes.weight):
         return None
     bins = np.floor(votes.yaw_rad % _QUARTER * (_BINS / _QUARTER)).astype(np.int64) % _BINS

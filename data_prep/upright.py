@@ -11,17 +11,17 @@ from sceneprior.core.geometry.corners import CUBE_CORNERS
 from sceneprior.core.shards import Sightings
 
 VIEWS_AT_MOST = 10
-"""Views used per object; more only take longer."""
+"""Maximum number of views used per object; more only take longer."""
 _VIEWS_AT_LEAST = 3
 _PARALLAX_RAD = np.radians(10)
-"""The widest angle between two rays to an object must exceed this, or its distance is a guess."""
+"""Minimum of the widest angle between two rays to an object; below it, distance is uncertain."""
 _NEAR_M = 0.05
 _STEPS, _PATIENCE = 30, 3
 """Maximum number of steps, and of consecutive steps without progress."""
 _DELTA = 1e-5
 """Step of the finite differences, in metres, logarithms and radians."""
 _SIDES_AT_LEAST = 8
-"""Unoccluded sides, over all views, that determine the seven parameters of a box."""
+"""Minimum number of unoccluded sides, over all views, to determine a box's seven parameters."""
 
 
 class _Given(NamedTuple):
@@ -58,8 +58,8 @@ def fit_upright(
     """Fit a box, rotated about +y only, to the 2D boxes of each object in T views.
 
     Robust least squares over the distances between the sides of the projected box and of the 2D
-    box. A side that may be occluded counts only where the 2D box reaches beyond the projected box.
-    `world_to_camera`, (T, 4, 4), has OpenCV axes and metres; the world's y points up.
+    box. A side that may be occluded counts only if the 2D box extends beyond the projected box
+    there. `world_to_camera`, (T, 4, 4), has OpenCV axes and metres; the world's y points up.
 
     Returns:
         Corners of the boxes in the order of `CUBE_CORNERS`, (n, 8, 3), NaN where the views do not

@@ -33,7 +33,7 @@ def writing(out: Path, what: str = "") -> Iterator[None]:
     except OSError as error:
         where = error.filename or out
         about = f" ({what})" if what else ""
-        advice = "make room on the disk and " if error.errno in _FULL else ""
+        advice = "free space on the disk and " if error.errno in _FULL else ""
         raise InputError(
             f"{where}{about} cannot be written ({error.strerror or error}). "
             f"Finished shards are kept: {advice}run the same command again to continue."

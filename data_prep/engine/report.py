@@ -26,7 +26,7 @@ _COLUMNS = ("room_id", "house", "split", "status", "rule", "reason", "views", "o
 
 
 def line_of(result: PreparedRoom | Line, task: RoomTask, label_set_name: str) -> Line:
-    """Line of a room that was prepared, or left out, with its split."""
+    """Report line of a room that was prepared or left out, with the room's split."""
     if isinstance(result, Line):
         return replace(result, split=task.split)
     names = label_set(label_set_name)
@@ -113,7 +113,7 @@ def compare(expected: Expected, prepared: Sequence[Line]) -> list[dict[str, Any]
 
 
 def _kinds_of_notes(lines: Sequence[Line]) -> dict[str, int]:
-    """Numbers of rooms per kind of note (names and numbers masked), most frequent first."""
+    """Number of rooms per type of note (names and numbers masked), most frequent first."""
     kinds: Counter[str] = Counter()
     for line in lines:
         kinds.update({re.sub(r"'[^']*'|\S*\d\S*", "...", note) for note in line.notes})
@@ -187,7 +187,7 @@ class Summary:
             "renderer": self.renderer,
             "summary": str(self),
         }
-        # The expected counts are those of the whole data set.
+        # Expected counts are known only for the whole data set.
         expected = self.source.expected if self.source.only is None else None
         return make_report(self.lines, about, expected)
 
@@ -208,7 +208,8 @@ class Summary:
 def finish(out: Path, plan: Plan, totals: Summary) -> None:
     """Write the report, then the index, which marks the folder as finished.
 
-    Without any prepared room, or any of `train`, only the report is written: an `InputError`.
+    If no room was prepared, or none of `train`, only the report is written and an `InputError`
+    raised.
     """
     if plan.settings["only"] is None and totals.source.only is not None:
         # A run with `--only` made the last missing shard: report on the whole data set.

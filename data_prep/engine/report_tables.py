@@ -18,7 +18,7 @@ def make_table(
     """Format rows of texts and numbers as a table."""
     table = Table(*columns, caption=caption)
     for row in rows:
-        # Text, because rich parses [brackets] in plain strings as markup.
+        # Cells are `Text`, because rich parses [brackets] in plain strings as markup.
         table.add_row(*(Text(str(cell)) for cell in row))
     return table
 

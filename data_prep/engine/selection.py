@@ -98,7 +98,7 @@ def select(survey: Survey, only: str | None, where: str, splits: str = "") -> Su
 
     `where` ends the error's sentence "No room of ...": "FOLDER passes the recipe NAME". `splits` is
     the origin of the splits, named in the error if `train` is empty; "" for seeded splits, whose
-    `train` never is. `val` and `test` may be empty.
+    `train` is never empty. `val` and `test` may be empty.
     """
     rooms = tuple(room for room in survey.rooms if is_asked_for(only, room.room_id, room.house))
     left_out = tuple(

@@ -41,7 +41,7 @@ def make_shard(
     path = out / shard.name
     first, last = shard.rooms[0].room_id, shard.rooms[-1].room_id
     with writing(out, f"rooms {first} to {last}"):
-        # The report goes first: without it, the shard counts as unfinished if we stop here.
+        # The report is deleted first, so that the shard counts as unfinished if the job stops here.
         _report_path(path).unlink(missing_ok=True)
         path.unlink(missing_ok=True)
         renderer = None if renderer_kind is None else open_renderer(renderer_kind)

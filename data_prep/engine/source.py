@@ -22,7 +22,7 @@ _DEBUG_VARIABLE = "SCENEPRIOR_DEBUG"
 
 
 class Expected(Section):
-    """Known counts of a finished job on the real data set."""
+    """Expected counts of a finished job on the real data set."""
 
     of: str = ""
     """Origin of the counts, data and author: "3D-FRONT, ATISS's index"."""
@@ -57,11 +57,11 @@ class Line:
     """Id of the room; the house's name if its list of rooms could not be read."""
     house: str
     status: str
-    """prepared; filtered: excluded by a rule; failed: the files are faulty."""
+    """`prepared`, `filtered` (excluded by a rule), or `failed` (the files are faulty)."""
     rule: str = ""
     """Name of the rule that filters the room: a rule of the recipe, or `split`, `no_view`, ..."""
     reason: str = ""
-    """Reason why the room is not prepared, as a sentence."""
+    """Sentence on why the room is not prepared."""
     split: str = ""
     views: int = 0
     objects: int = 0

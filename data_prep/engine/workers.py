@@ -26,7 +26,7 @@ def pool(workers: int) -> Iterator[Run]:
     if workers <= 1:
         yield _in_process
         return
-    # Spawned, never forked: a GL context does not survive a fork.
+    # Processes are spawned, never forked, because a GL context does not survive a fork.
     context = multiprocessing.get_context("spawn")
     executor = ProcessPoolExecutor(workers, context, initializer=_start_worker)
 

@@ -72,11 +72,11 @@ def placement_of(
 
 
 def surface_of(mesh: dict[str, Any], child: dict[str, Any]) -> tuple[np.ndarray, int]:
-    """Triangles of a floor, wall or ceiling in the house's frame, placed as its child says.
+    """Triangles of a floor, wall or ceiling in the house's frame, placed by its `child` entry.
 
     Returns:
-        (F, 3, 3) in metres, where F may be 0; and the number of left out triangles, those with
-        missing vertices or implausible coordinates.
+        (F, 3, 3) in metres, where F may be 0; and the number of triangles that are left out because
+        of missing vertices or implausible coordinates.
     """
     vertices = numbers(mesh.get("xyz") or [])
     faces = numbers(mesh.get("faces") or [])

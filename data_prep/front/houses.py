@@ -70,7 +70,7 @@ def key_of(uid: Any) -> str:
 
 
 def _by_uid(entries: list[Any]) -> dict[str, dict[str, Any]]:
-    """Index entries by uid. Of several entries with one uid, a valid one is preferred."""
+    """Index entries by uid; among entries with the same uid, a valid entry is preferred."""
     found: dict[str, dict[str, Any]] = {}
     for entry in entries:
         key = key_of(entry.get("uid")) if isinstance(entry, dict) else ""

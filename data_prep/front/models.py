@@ -14,7 +14,7 @@ from sceneprior.core.scene import Mesh
 _NO_FURNITURE_M = 10.0
 """Longest plausible side of a model; nearly all models in centimetres exceed it."""
 _OVERSIZED = (50.0, 200.0)
-"""Range of the ratio longest side / longest side stated by the house for a file in centimetres."""
+"""Range of the ratio between a mesh's longest side and the house's statement, for centimetres."""
 _CACHE_BYTES = 512 * 2**20
 """Size of a process's mesh cache: about two thousand models of 3D-FUTURE's usual size."""
 
@@ -44,8 +44,9 @@ class ModelBank:
     def load(self, model_id: str) -> Mesh:
         """Load a mesh in metres. A file is read again if it changed or was evicted from the cache.
 
-        About a hundred models of the release are in centimetres. A model with a side longer than
-        10 m is taken for one of them and scaled by 0.01; `unit_of` finds those that are smaller.
+        About a hundred models of the release are in centimetres. A model with a side longer than 10
+        m is assumed to be in centimetres and scaled by 0.01; `unit_of` finds smaller models in
+        centimetres.
         """
         path = self.folder / model_id / MODEL_FILE
         return self._read(path, file_stamp(path))

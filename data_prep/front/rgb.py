@@ -30,7 +30,7 @@ def rgb_files(
 ) -> dict[str, bytes]:
     """Render every view; returns the PNG bytes by path, `rgb/<room>/<view>.png`.
 
-    Void furniture is drawn, too. `colors` has one entry per piece; None means the colour of its
+    Void furniture is also drawn. `colors` has one entry per piece; None means the colour of its
     class. All types of renderers draw the same picture (`Renderer.shaded`).
     """
     names = label_set(label_set_name)

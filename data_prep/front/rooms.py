@@ -35,7 +35,7 @@ STUFF_OF_MESH = {
     "BayWindow": "window", "Ceiling": "ceiling", "CustomizedCeiling": "ceiling",
     "SmartCustomizedCeiling": "ceiling", "ExtrusionCustomizedCeilingModel": "ceiling",
 }  # fmt: skip
-"""Class in `STUFF` of the types of meshes that one sees from inside a room."""
+"""Class in `STUFF` of each mesh type that is visible from inside a room."""
 
 
 @dataclass
@@ -118,7 +118,8 @@ class _RoomReader:
         placed = [
             (child, entry)
             for child in children
-            # Skips surfaces, dangling references, and furniture that 3D-FRONT marks as invalid.
+            # This skips surfaces, dangling references, and furniture that 3D-FRONT marks as
+            # invalid.
             if (entry := self.house.furniture.get(key_of(child.get("ref")))) and is_valid(entry)
         ]
         if not placed:

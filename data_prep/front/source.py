@@ -73,7 +73,7 @@ class FrontSource:
         return {
             "recipe": {
                 **self.recipe.model_dump(exclude={"expected"}),
-                # Hashed, because they may be thousands.
+                # The ids are hashed, because there may be thousands.
                 "invalid_rooms": _digest_of_ids(self.recipe.invalid_rooms),
                 "invalid_models": _digest_of_ids(self.recipe.invalid_models),
             },
@@ -129,7 +129,7 @@ class FrontSource:
             why = reasons[0] if reasons else "it is no longer in the house file"
             return Line(task.room_id, task.house, "failed", reason=why)
         room = read.rooms[0]
-        # Checked again, now with meshes: unreadable models may leave too little furniture.
+        # The rules are checked again with meshes: unreadable models may leave too little furniture.
         broken = broken_rule(room, self.recipe)
         made = None
         if broken is None:
@@ -169,8 +169,8 @@ def _digest_of_ids(ids: tuple[str, ...]) -> str | None:
     return digest("\n".join(ids)) if ids else None
 
 
-# Cached from room to room within a process. The stamps make workers that outlive the job, such as
-# those of a cluster, reread a file that was repaired.
+# Models and houses are cached from room to room within a process. The stamps make workers that
+# outlive the job, such as those of a cluster, reread a repaired file.
 @functools.lru_cache(maxsize=1)
 def _bank(future: Path, stamp: tuple[int, int]) -> ModelBank:
     return ModelBank(future)

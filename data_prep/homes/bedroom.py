@@ -18,13 +18,13 @@ COUNTS = {2: 157, 3: 782, 4: 1731, 5: 2057, 6: 1296, 7: 821, 8: 419, 9: 234, 10:
           12: 21, 13: 7}  # fmt: skip
 """Histogram of the number of pieces per room over the paper authors' 7,835 bedrooms.
 
-Rooms with one piece or more than 13 are left out here, too.
+Rooms with one piece or more than 13 pieces are left out here as well.
 """
 
 BEDS = {"double_bed": 0.70, "single_bed": 0.18, "kids_bed": 0.12}
 
 ANGLED = 0.8
-"""Chance that a seat is rotated off the axes; this makes one piece in ten of all furniture."""
+"""Chance that a seat is rotated off the axes, so that one piece in ten of all furniture is."""
 LAMP_ANGLED = 0.3
 
 EXTRAS: Offers = {

@@ -104,7 +104,7 @@ class Plan:
     """Corner rectangle cut out of an L-shaped room."""
     pieces: list[Piece] = field(default_factory=list)
     kept_clear: list[Rect] = field(default_factory=list)
-    """Floor that stays empty: first the door's, then that in front of pieces with a clearance."""
+    """Floor that stays empty: first at the door, then in front of pieces with a clearance."""
 
     @property
     def area(self) -> float:
@@ -114,7 +114,7 @@ class Plan:
 
     @property
     def beside_notch(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Ranges of x and of z beside the notch; the whole room's without a notch."""
+        """Ranges of x and of z beside the notch; without a notch, those of the whole room."""
         if self.notch is None:
             return (0.0, self.width), (0.0, self.depth)
         x0, z0, x1, z1 = self.notch

@@ -37,8 +37,8 @@ def make_homes(out: Path, rooms: int, room_type: str, seed: int) -> None:
         OUT/3D-FUTURE-model/<jid>/raw_model.obj, OUT/3D-FUTURE-model/model_info.json
         OUT/splits/<room type>.csv    rows `<house uid>_<room instanceid>,train|val|test`
 
-    The same arguments write the same bytes, and room k does not depend on `rooms`. The folder is
-    new, or an empty one, and appears only when it is complete.
+    The same arguments write the same bytes, and room k does not depend on `rooms`. The folder must
+    be new or empty, and appears only when it is complete.
     """
     out = Path(out).expanduser().absolute()
     _check(out, rooms, room_type, seed)
@@ -136,7 +136,7 @@ def _house(
 
 
 def _kind(plan: Plan, taken: set[str]) -> str:
-    """3D-FRONT's type of such a room; a house has one master bedroom."""
+    """The room's type in 3D-FRONT; a house has at most one master bedroom."""
     names = {piece.model.name for piece in plan.pieces}
     if not names & set(BEDS):
         dining = any(p.model.name == "table" and p.model.size_m[0] > 1.0 for p in plan.pieces)

@@ -73,7 +73,7 @@ class Furnisher:
         tries: int = 40,
         where: float | None = None,
     ) -> Piece | None:
-        """Place a piece with its back to one of the walls, by default of all.
+        """Place a piece with its back to one of `walls` (None: all walls).
 
         `clearance` metres in front of the piece stay clear. `corner` is the chance to try an end of
         the wall. `where` is the desired position of the piece's centre along the wall in metres;

@@ -15,7 +15,7 @@ WALL_M = 0.12
 """Thickness of a wall."""
 _DOOR_HEIGHT_M = 2.0
 _BEFORE_WALL_M = 0.005
-"""Distance of a door from its wall, which has no hole."""
+"""Distance by which a door stands in front of its wall, which has no hole."""
 
 _IDENTITY = {"pos": [0, 0, 0], "rot": [0, 0, 0, 1], "scale": [1, 1, 1]}
 
@@ -116,7 +116,7 @@ def shell(plan: Plan) -> list[tuple[str, np.ndarray]]:
 
 
 def _door(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of the door: the side of the clear floor before it that is nearest to a wall."""
+    """Ends of the door: the side, nearest to a wall, of the clear floor in front of the door."""
     x0, z0, x1, z1 = plan.kept_clear[0]
     half_m = np.array([x1 - x0, z1 - z0]) / 2
     middle, found = np.array([(x0 + x1) / 2, (z0 + z1) / 2]), []

@@ -16,7 +16,7 @@ MARGIN = 0.02
 side. A pose error of 5 cm has this effect at a distance of 2.5 m, in views of 90 degrees."""
 HELD_AT_LEAST = {"mesh": 0.95, "box": 0.8}
 """Minimum share of masks that lie within their projections. Occluders and the image border only
-shrink masks, so with correct poses all should. Shuffled cameras reach 0.07 to 0.15."""
+shrink masks, so with correct poses all masks should. Shuffled cameras reach 0.07 to 0.15."""
 IOU_AT_LEAST = {"mesh": 0.85, "box": 0.5}
 """Minimum mean IoU of the 2D boxes of fully visible objects. A mesh and its mask agree to the
 pixel, except for parts thinner than a pixel. The corners of a 3D box project beyond its object's
@@ -53,7 +53,7 @@ class Agreement:
     """Sums of comparisons, by type of 3D representation."""
 
     tallies: dict[str, Tally] = field(default_factory=dict)
-    """One per key of `KINDS` that occurs."""
+    """Tally by key of `KINDS`, for those that occur."""
 
     def __add__(self, other: "Agreement") -> "Agreement":
         kinds = [kind for kind in KINDS if kind in self.tallies or kind in other.tallies]
@@ -85,12 +85,12 @@ class Comparison(NamedTuple):
     kinds: tuple[str, ...]
     """(n,) keys of `KINDS`; "" for an object without a 3D representation."""
     judged: np.ndarray
-    """(T, n) bool: the view has a mask of the object, and the object has a 3D representation."""
+    """(T, n) bool: the view has a mask of the object, which has a 3D representation."""
     held: np.ndarray
     """(T, n) bool: the mask lies within the projection; False where that is undefined."""
     whole: np.ndarray
-    """(T, n) bool: the object is fully visible, that is, cut off neither by the image border nor
-    by another object nor, where the ground truth tells, by anything else in the room."""
+    """(T, n) bool: the object is fully visible, that is, cut off neither by the image border nor by
+    another object nor (if the ground truth is known) by anything else in the room."""
     iou: np.ndarray
     """(T, n) IoU of the 2D boxes of mask and projection; 0 where that is undefined."""
 

@@ -1,4 +1,4 @@
-"""Mistakes in cameras, and a room's cameras after the correction of each."""
+"""Possible mistakes in cameras, and a room's cameras after the correction of each mistake."""
 
 from itertools import permutations, product
 from typing import NamedTuple
@@ -8,12 +8,13 @@ import numpy as np
 from sceneprior.core.shards import RoomViews
 
 Axes = tuple[tuple[int, ...], ...]
-"""Axes of a camera, x, y and z, as rows: the part of each to the right, down and forward."""
+"""A camera's x, y and z axes as rows, each with its components to the right, down and forward."""
 OPENCV: Axes = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 OPENGL: Axes = ((1, 0, 0), (0, -1, 0), (0, 0, -1))
 C2W, W2C, TURNED, MOVED = "c2w", "w2c", "turned", "moved"
-"""Contents of a matrix: camera to world, world to camera; a camera's position beside the rotation
-from world to camera, and a rotation from camera to world beside the translation to the camera."""
+"""Possible contents of a matrix: camera to world; world to camera; the camera's position with the
+rotation from world to camera; the translation to the camera with the rotation from camera to
+world."""
 FOCAL_STEPS = tuple(k for k in range(-8, 9) if k)
 """Powers of 2^(1/6) = 1.12 by which focal lengths are scaled: 0.4 to 2.5."""
 _OFF = (-0.3, -0.15, 0.0, 0.15, 0.3)
@@ -22,12 +23,14 @@ _SHIFTS = tuple((across, down) for across in _OFF for down in _OFF if across or 
 
 
 class Cause(NamedTuple):
-    """A mistake in a room's cameras, of one of these families; other fields keep their defaults.
+    """A mistake in a room's cameras.
 
-    given: none. poses: matrices hold `reading` with `axes`; the world is left-handed if the axes
-    are. order: frames are in the order `detail`. focal: focal lengths must be `factor` times as
-    long. center: the principal point must be moved by `shift`. middle: it must be in the middle.
-    size: the intrinsics are of pictures of another size. chance: cameras of other frames.
+    Its family is one of the following; fields that a family does not use keep their defaults.
+    given: no mistake. poses: the matrices hold `reading` with `axes`; the world is left-handed if
+    the axes are. order: frames are in the order `detail`. focal: focal lengths must be multiplied
+    by `factor`. center: the principal point must be moved by `shift`. middle: the principal point
+    must be at the image centre. size: the intrinsics belong to pictures of another size. chance:
+    the cameras belong to other frames.
     """
 
     family: str
@@ -55,10 +58,10 @@ class Convention(NamedTuple):
 
 
 def corrected(views: RoomViews, convention: Convention) -> dict[Cause, Cameras]:
-    """Cameras after the correction of each cause; `GIVEN` has them as they are.
+    """Cameras after the correction of each cause; those of `GIVEN` are unchanged.
 
-    The causes depend on the convention alone, so that rooms can be added up. Likelier ones come
-    first.
+    The causes depend only on the convention, so that sums over rooms are possible. Likelier causes
+    come first.
     """
     poses, lenses = views.world_to_camera.astype(np.float64), views.intrinsics.astype(np.float64)
     found = {GIVEN: (poses, lenses)}
@@ -73,7 +76,7 @@ def corrected(views: RoomViews, convention: Convention) -> dict[Cause, Cameras]:
 
 
 def _poses(poses: np.ndarray, convention: Convention) -> dict[Cause, np.ndarray]:
-    """World-to-camera matrices if the written ones held something else, or had other axes."""
+    """World-to-camera matrices under each hypothesis on what the written matrices hold."""
     of_world = np.linalg.inv(convention.room_from_world) @ np.linalg.inv(poses)
     written = of_world @ np.linalg.inv(_square(convention.axes))
     if convention.reading == W2C:
@@ -91,7 +94,7 @@ def _poses(poses: np.ndarray, convention: Convention) -> dict[Cause, np.ndarray]
     for reading, axes in usual + rare:
         if (reading, axes) != (convention.reading, convention.axes):
             camera_to_world = contents[reading] @ _square(axes)
-            # A mirrored world can be turned until the room's z is the mirrored axis.
+            # A mirrored world can be rotated until the room's z is the mirrored axis.
             mirror = np.diag([1.0, 1, np.linalg.det(_square(axes)), 1])
             in_room = mirror @ convention.room_from_world @ camera_to_world
             found[Cause("poses", reading, axes)] = np.linalg.inv(in_room)
@@ -124,7 +127,7 @@ def _matrix(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
 
 
 def _orders(frames: int) -> dict[str, np.ndarray]:
-    """For each way in which poses may be misplaced, the place of each frame's own pose."""
+    """For each way in which poses may be out of order, the index of each frame's own pose."""
     numbers = np.arange(frames)
     as_text = np.array(sorted(range(frames), key=lambda k: str(k + 1)), dtype=np.int64)
     return {
@@ -162,7 +165,7 @@ def _lenses(lenses: np.ndarray, image_size: tuple[int, int]) -> dict[Cause, np.n
 
 
 def _dealt_out(frames: int) -> np.ndarray:
-    """A shuffled order in which no frame keeps its place."""
+    """A random order in which no frame keeps its place."""
     order = np.random.default_rng(0).permutation(frames)
     dealt = np.empty_like(order)
     dealt[order] = np.roll(order, 1)

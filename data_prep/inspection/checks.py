@@ -1,4 +1,4 @@
-"""Finds faults in the arrays of one room, as sentences."""
+"""Finds faults in the arrays of one room, and describes each in a sentence."""
 
 from collections.abc import Iterator
 
@@ -10,7 +10,8 @@ from sceneprior.core.shards import RoomGroundTruth, RoomViews
 
 
 def array_problems(views: RoomViews, classes: int) -> Iterator[str]:
-    """Report values out of range in the views; `Shard.read_room` has found them to be finite."""
+    """Report values out of range in the views; `Shard.read_room` has checked that they are
+    finite."""
     if (views.object_class < 1).any():
         yield f"a class index is outside 1 to {classes - 1}"
     turn = views.world_to_camera[:, :3, :3].astype(np.float64)
@@ -35,7 +36,7 @@ def array_problems(views: RoomViews, classes: int) -> Iterator[str]:
 def mask_problems(views: RoomViews) -> Iterator[str]:
     """Report the first 2D box, pixel count or clear side that disagrees with its mask."""
     assert views.instance_ids is not None
-    # Any class but void, whose masks are not measured.
+    # All objects get a class other than void, because void masks are not measured.
     seen = observe(views.instance_ids, [VOID + 1] * len(views.object_class) + [VOID])
     visible, boxes, pixels, clear = (
         np.zeros_like(getattr(views, name))

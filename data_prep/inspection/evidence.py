@@ -1,4 +1,4 @@
-"""Evidence of one room for and against each mistake, from its masks and cameras alone."""
+"""Evidence for and against each camera mistake, from one room's masks and cameras alone."""
 
 from typing import NamedTuple
 
@@ -11,32 +11,32 @@ from data_prep.posed.floor import find_floor
 from sceneprior.core.shards import RoomViews
 
 _LEAST_VIEWS = 5
-"""Views from which on the order of frames can be compared."""
+"""Minimum number of views for comparing the order of frames."""
 
 _SAME_FLOOR_M = 0.1
 _PIECES = 3
-"""Minimum number of pieces that tell the floor of a room: two lamps may hang at one height."""
+"""Minimum number of pieces that determine a room's floor: two lamps may hang at the same height."""
 
 
 class Evidence(NamedTuple):
     """Evidence of one room."""
 
     sums: dict[Cause, float]
-    """Agreement of middles with cameras (`fit`), summed, after the correction of each cause."""
+    """Summed agreement (`fit`) of box middles with cameras, after the correction of each cause."""
     rooms: int
     middles: int
     spare: int
-    """Middles beyond those that the objects' points take."""
+    """Number of box middles beyond those needed to determine the objects' points."""
     views: int
     ids: int
     masks: int
     once: int
-    """Ids that are in one view only."""
+    """Number of ids that occur in one view only."""
     measured: int
-    """Objects whose lengths are known."""
+    """Number of objects whose lengths are known."""
     nearness: float | None
-    """Rank correlation, over pairs of views, of the pixels on the same objects and the angle
-    between the cameras, negated: about 0 if poses belong to other frames. None for few views."""
+    """Negated rank correlation, over pairs of views, between the pixels on common objects and the
+    angle between the cameras; about 0 if poses belong to other frames. None for few views."""
     tops: tuple[float, float, float]
     """Mean direction of the tops of the pictures in the room frame; y should be up."""
     eye_m: float
@@ -44,7 +44,7 @@ class Evidence(NamedTuple):
     length_m: float | None
     """Median length of the objects; None without any."""
     floor_m: float | None
-    """Height at which the lowest objects end (`find_floor`); None if few of them agree."""
+    """Height of the bottoms of the lowest objects (`find_floor`); None if few of them agree."""
 
     def share(self, cause: Cause) -> float:
         """Mean agreement in [0, 1] after a correction."""
@@ -54,7 +54,7 @@ class Evidence(NamedTuple):
 def room_evidence(views: RoomViews, convention: Convention, floor: bool = True) -> Evidence:
     """Compare the masks of one room, read with images, with its cameras as they are and corrected.
 
-    `floor` asks for the height of the floor, which takes longer than all else.
+    `floor` also estimates the height of the floor, which takes longer than everything else.
     """
     found, cameras = middles(views), corrected(views, convention)
     agreement, depth = fit(found, *map(np.stack, zip(*cameras.values(), strict=True)))
@@ -74,7 +74,7 @@ def room_evidence(views: RoomViews, convention: Convention, floor: bool = True) 
 
 
 def total(rooms: list[Evidence]) -> Evidence:
-    """Evidence of several rooms together: sums of counts, medians or means of the others."""
+    """Combine the evidence of several rooms: sums of counts, medians or means of other values."""
     causes = {cause: None for room in rooms for cause in room.sums}
     sums = {cause: sum(room.sums.get(cause, 0.0) for room in rooms) for cause in causes}
     names = ("rooms", "middles", "spare", "views", "ids", "masks", "once", "measured")
@@ -96,7 +96,7 @@ def total(rooms: list[Evidence]) -> Evidence:
 
 
 def _usual(floors: list[float], rooms: int) -> float | None:
-    """Median height of the floors found; None if few are found, or if they differ."""
+    """Median height of the estimated floors; None if there are few, or if they differ."""
     if not floors:
         return None
     middle = float(np.median(floors))
@@ -109,7 +109,7 @@ def _nearness(views: RoomViews) -> float | None:
     if len(views.visible) < _LEAST_VIEWS:
         return None
     turns = views.world_to_camera[:, :3, :3].astype(np.float64)
-    cosines = np.einsum("aij,bij->ab", turns, turns)  # of the angle, times 2, plus 1
+    cosines = np.einsum("aij,bij->ab", turns, turns)  # 2 cos(angle between views) + 1
     pixels = views.mask_pixels * views.visible
     parts = pixels / np.maximum(pixels.sum(axis=1, keepdims=True), 1)
     shared = np.minimum(parts[:, None], parts[None]).sum(axis=-1)

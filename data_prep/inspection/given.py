@@ -1,4 +1,4 @@
-"""The files that a folder's cameras were read from, and the convention of their matrices."""
+"""The files from which a folder's cameras were read, and the convention of their matrices."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,11 +32,11 @@ _COLMAP = ("cameras.bin", "cameras.txt")
 
 
 def given_of(folder: Path, source: Any) -> tuple[Given, dict[str, Given], str | None]:
-    """Origin of cameras from a source (of index.json), and of single rooms, by id; and a sentence
-    if more rooms failed than were prepared.
+    """Usual origin of the cameras of a source (from index.json); origin of the cameras of single
+    rooms by id; and a sentence if more rooms failed than were prepared.
 
-    The report says what a room's poses were read from (`PreparedRoom.cameras`). If it is missing or
-    from an earlier release, the origin is that of the source.
+    The report states the origin of a room's poses (`PreparedRoom.cameras`). If the report is
+    missing or from an earlier release, the usual origin of the source is assumed.
     """
     usual = _OF_SOURCE.get(str(source), _OF_SOURCE["3d-front"])
     try:

@@ -86,7 +86,7 @@ def choose_views(folder: Path, room_id: str | None, pictures: int) -> list[tuple
         share = pictures // len(rooms) + (i < pictures % len(rooms))
         with Shard(path) as shard:
             views = len(shard.read_room(name).visible)
-        # Evenly spaced, because the views of a recording are in temporal order.
+        # Views are evenly spaced, because a recording's views are in temporal order.
         places = np.unique(np.linspace(0, views, min(share, views), endpoint=False).astype(int))
         chosen += [(path, name, int(view)) for view in places]
     return chosen
@@ -98,7 +98,7 @@ def draw_view(
     """Draw one view: masks in class colours and 2D boxes; ground-truth 3D boxes as black wires.
 
     A bar in front of each wire box marks the piece's front. The floor (y = 0) is a metric grid
-    with the axes of the room frame, so that a wrong floor, axis or unit shows even without 3D
+    with the axes of the room frame, so that a wrong floor, axis or unit is noticed even without 3D
     ground truth. Line widths and font sizes do not depend on `width_px`.
     """
     room = shard.read_room(room_id)
@@ -241,7 +241,7 @@ def _floor_bounds(room: RoomViews, truth: RoomGroundTruth | None) -> tuple[np.nd
         turn, place = room.world_to_camera[:, :3, :3], room.world_to_camera[:, :3, 3]
         points = -np.einsum("tij,ti->tj", turn, place)[:, (0, 2)]
         points = np.concatenate([points - 1, points + 1])
-    # Clipped, because a unit wrong by a factor of a thousand would need a million lines.
+    # The bounds are clipped, because a unit wrong by a factor of 1000 would need a million lines.
     return (
         np.clip(points.min(axis=0), -_LARGEST_GRID_M, -_GRID_M).astype(np.float64),
         np.clip(points.max(axis=0), _GRID_M, _LARGEST_GRID_M).astype(np.float64),

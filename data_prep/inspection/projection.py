@@ -71,7 +71,7 @@ def hull_of(points_m: np.ndarray) -> Hull:
     """Convex hull of points, (P, 3): it has the same projected 2D box with fewer points."""
     low, high = points_m.min(axis=0), points_m.max(axis=0)
     try:
-        # Joggled (QJ), because flat point sets have no hull of their own.
+        # Points are joggled (QJ), because flat point sets have no hull.
         found = ConvexHull(points_m, qhull_options="QJ")
     except QhullError:
         return Hull(box_corners((low + high) / 2, high - low), np.array(BOX_EDGES))

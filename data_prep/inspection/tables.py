@@ -23,7 +23,7 @@ _JUDGED = ("fit of cameras", "in 3D", "masks within", "mean 2D IoU")
 
 
 def count_tables(folder: Path) -> list[Table]:
-    """Counts of each split, and its objects of each class."""
+    """Tables of the counts per split, and of the objects per class."""
     names = label_set(read_index(folder)["label_set"])
     totals, classes = [], {}
     turned: list[float] = []
@@ -60,7 +60,7 @@ def count_tables(folder: Path) -> list[Table]:
 
 
 def room_table(folder: Path, room_id: str) -> Table:
-    """The objects of one room; share is the mean area of an object's 2D boxes."""
+    """Table of one room's objects; `share` is the mean area of an object's 2D boxes."""
     ((path, _, _),) = choose_views(folder, room_id, 1)
     with Shard(path) as shard:
         views = shard.read_room(room_id)
@@ -95,7 +95,7 @@ def check_tables(found: FolderCheck) -> list[Table]:
     tables = [make_table(("split", "rooms", "views", "checksums", *_JUDGED), totals)]
     if judged:
         worst = sorted(judged, key=_least)[:_WORST_SHOWN]
-        # Folded, because the end of an id, its room's name, must survive narrow terminals.
+        # Ids are folded, because their ends, the rooms' names, must survive narrow terminals.
         columns = (Column("worst rooms", overflow="fold"), *_JUDGED)
         tables.append(make_table(columns, [(check.room_id, *_judged([check])) for check in worst]))
     return tables
@@ -114,8 +114,8 @@ def _fit(checks: Sequence[RoomCheck]) -> float | None:
 
 
 def _judged(checks: Sequence[RoomCheck]) -> list[str]:
-    """Table cells: fit of masks and cameras; 3D representation, share of masks within projections,
-    IoU if fully visible."""
+    """Table cells: agreement of masks and cameras, type of 3D representation, share of masks within
+    their projections, and mean IoU of fully visible objects."""
     agreement = sum((check.agreement for check in checks), Agreement())
     cells = [
         (
@@ -131,7 +131,7 @@ def _judged(checks: Sequence[RoomCheck]) -> list[str]:
 
 
 def summary(found: FolderCheck) -> str:
-    """Say what was checked in a folder without problems, and what could not be."""
+    """State which checks a folder without problems has passed, and which were not possible."""
     evidence = found.evidence
     assert evidence is not None, "a folder without problems has evidence"
     yes, no = what_was_checked(evidence)
@@ -147,7 +147,7 @@ def summary(found: FolderCheck) -> str:
         parts.append(text)
     parts.append(counts(evidence))
     fit = (
-        f"masks fit the cameras by {evidence.share(GIVEN):.2f} of 1 (shuffled cameras: "
+        f"masks and cameras agree by {evidence.share(GIVEN):.2f} of 1 (shuffled cameras: "
         f"{evidence.share(CHANCE):.2f})"
     )
     if yes:

@@ -1,4 +1,4 @@
-"""Tests ids of masks against the objects that are found without them."""
+"""Tests the ids of masks against objects that are found without ids."""
 
 from typing import NamedTuple
 
@@ -11,13 +11,13 @@ from sceneprior.core.instances.observations import observe
 from sceneprior.core.shards import RoomViews
 
 _GAIN = 1.3
-"""Factor by which objects found without ids must explain more than the ids given."""
+"""Minimum ratio of the agreement of objects found without ids to that of the given ids."""
 _FIT = 0.6
-"""Least mean agreement of the objects found."""
+"""Minimum mean agreement of the objects found without ids."""
 
 
 class Trial(NamedTuple):
-    """Agreement summed, and number of middles, with the ids given and with objects found."""
+    """Summed agreement and number of box middles, with the given ids and with objects found."""
 
     given: float
     given_middles: int
@@ -26,14 +26,14 @@ class Trial(NamedTuple):
 
     @property
     def repairs(self) -> bool:
-        """True if the objects found fit the cameras, and explain more than the ids given."""
+        """True if the objects found fit the cameras, and explain more than the given ids."""
         fits = self.found > _FIT * self.found_middles
-        # Right poses under wrong ids: most masks join others. Wrong poses: hardly any does.
+        # With right poses and wrong ids, most masks join others; with wrong poses, hardly any do.
         return fits and self.found > _GAIN * self.given and 2 * self.found > self.given_middles
 
 
 def try_tracks(views: RoomViews) -> Trial:
-    """Find the objects of a room, read with images, without its ids and classes, and compare."""
+    """Find a room's objects without ids and classes, and compare; `views` must include images."""
     assert views.instance_ids is not None
     void = len(views.object_class) + 1
     ids = np.where(views.instance_ids == void, UNKNOWN, 0).astype(np.int32)
@@ -42,7 +42,7 @@ def try_tracks(views: RoomViews) -> Trial:
         for k in np.unique(image[(image > 0) & (image < void)]).tolist():
             count += 1
             ids[view][image == k] = count
-    # Classes of wrong ids are wrong, too.
+    # All masks get one class, because the classes of wrong ids would be wrong.
     masks = FrameMasks(ids, np.ones(count, dtype=np.int64))
     tracks = associate(masks, views.world_to_camera, views.intrinsics)
     objects = len(tracks.object_class)

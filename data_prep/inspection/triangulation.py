@@ -1,8 +1,9 @@
-"""Measures how well cameras fit tracked masks: by points that triangulate the masks' middles.
+"""Measures how well cameras fit tracked masks, by triangulating the middles of 2D boxes.
 
 The middle of a 2D box, in u or in v, is taken as the projection of one 3D point of its object, if
-nothing cuts the box off along that axis. Under the right cameras these points exist, in front of
-the cameras. No ground truth is needed, and many hypotheses about the cameras are compared at once.
+nothing cuts the box off along that axis. With the right cameras, these points exist and lie in
+front of the cameras. No ground truth is needed, and many hypotheses about the cameras are compared
+at once.
 """
 
 from typing import NamedTuple
@@ -13,18 +14,18 @@ from data_prep.upright import own_sides
 from sceneprior.core.shards import RoomViews
 
 TOLERANCE, OF_BOX = 0.01, 0.15
-"""Distance at which a middle counts one half: relative to the longer side of the image, plus
-relative to the 2D box, whose middle is not exactly where a fixed point of the object projects."""
+"""Distance at which the agreement of a middle is one half: a share of the longer side of the image,
+plus a share of the 2D box, whose middle is not exactly the projection of a fixed point."""
 _MIDDLES_AT_MOST = 60
-"""Middles of one object, thinned evenly; more only take longer."""
+"""Maximum number of middles per object, thinned evenly; more only take longer."""
 _MIDDLES_AT_LEAST = 5
-"""Middles of one object that are compared: three determine a point."""
+"""Minimum number of middles per object; three determine a point."""
 _ROUNDS = 6
 _NEAR_M = 0.05
 
 
 class Middles(NamedTuple):
-    """Middles of the 2D boxes of a room, sorted by object: m of them."""
+    """The m middles of a room's 2D boxes, sorted by object."""
 
     view: np.ndarray
     """(m,)"""
@@ -37,16 +38,16 @@ class Middles(NamedTuple):
     extent_px: np.ndarray
     """(m,) size of the 2D box along this axis."""
     slack_px: np.ndarray
-    """(m,) distance at which a middle counts one half."""
+    """(m,) distance at which the agreement is one half."""
 
     @property
     def spare(self) -> int:
-        """Middles beyond the three that each object's point takes."""
+        """Number of middles beyond the three that determine each object's point."""
         return len(self.item) - 3 * len(np.unique(self.item))
 
 
 def middles(views: RoomViews) -> Middles:
-    """Find the middles of 2D boxes that nothing cuts off, of objects with enough of them."""
+    """Find the middles of 2D boxes that nothing cuts off, for objects with enough middles."""
     height, width = views.image_size
     own = own_sides(views, views.image_size)
     boxes = views.boxes.astype(np.float64) * [width, height, width, height]
@@ -74,12 +75,12 @@ def fit(
     """Agreement of each middle with each of h hypotheses about the cameras, and its depth.
 
     The agreement is 1 / (1 + (r / slack)^2) for the distance r in pixels from the middle to the
-    object's projected point, a robust least-squares solution; r is divided by one minus the
-    middle's leverage, so that it is about the distance to the point that the other middles
+    object's projected point, which is a robust least-squares solution. r is divided by one minus
+    the middle's leverage, and so approximates the distance to the point that the other middles
     determine. Points behind the camera score 0.
 
     Args:
-        world_to_camera: (h, T, 4, 4), OpenCV axes; the world may be any, in any unit.
+        world_to_camera: (h, T, 4, 4), OpenCV axes; the world frame and its unit are arbitrary.
         intrinsics: (h, T, 3, 3)
 
     Returns:
@@ -95,7 +96,8 @@ def fit(
     poses = scaled[:, found.view, :3]
     focal = intrinsics[:, found.view, found.axis, found.axis]
     center = intrinsics[:, found.view, found.axis, 2]
-    # A middle and the camera's axis span a plane, `planes @ (x, y, z, 1) = 0`, through the object.
+    # A middle and the camera's axis span a plane, `planes @ (x, y, z, 1) = 0`, that contains the
+    # point.
     planes = focal[..., None] * poses[:, rows, found.axis]
     planes = planes + (center - found.place_px)[..., None] * poses[:, :, 2]
     weight = 1 / np.abs(focal)
@@ -119,7 +121,8 @@ def fit(
 
 
 def _unit_of_length(world_to_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Poses whose cameras stand about 2 m from their middle, the origin; and their unit, (h,)."""
+    """Poses moved and scaled so that cameras stand about 2 m from the origin, their middle; and the
+    unit of length, (h,)."""
     turns = world_to_camera[..., :3, :3]
     eyes = -(turns.swapaxes(-1, -2) @ world_to_camera[..., :3, 3:])[..., 0]
     middle = eyes.mean(axis=1, keepdims=True)

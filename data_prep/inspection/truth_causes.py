@@ -1,4 +1,4 @@
-"""Why ground truth and masks disagree: likely mistakes are undone on trial."""
+"""Finds the reason why ground truth and masks disagree, by trying to repair likely mistakes."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
@@ -23,7 +23,7 @@ from sceneprior.core.shards import RoomViews
 Bodies = Sequence[Body | None]
 
 _Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float32)
-"""Rotation from a world with y up to one with z up."""
+"""Rotation from a world with y up to a world with z up."""
 
 
 class Trial(NamedTuple):
@@ -72,8 +72,8 @@ def likely_cause(
 def out_of_order(bodies: Bodies, views: RoomViews) -> tuple[np.ndarray, Comparison]:
     """Match cameras to frames one to one, so that they fit the masks best.
 
-    Returns, for each frame, the index of the frame whose camera fits, (T,), its own if no other
-    fits better; and the comparison with these cameras.
+    Returns, for each frame, the index of the frame whose camera fits best, (T,), which is its own
+    if no other fits better; and the comparison with these cameras.
     """
     boxes = projections(bodies, views)[:, None]  # one per camera, the same for all frames
     frames = len(views.visible)
@@ -92,8 +92,8 @@ def out_of_order(bodies: Bodies, views: RoomViews) -> tuple[np.ndarray, Comparis
 def _other_ids(bodies: Bodies, views: RoomViews) -> Trial | None:
     """Match masks to the objects that they fit best.
 
-    Masks that fit no object are left out, as ids may have been shifted onto walls; None if the
-    others are less than a quarter of all masks.
+    Masks that fit no object are left out, because ids may have been shifted onto walls; None if
+    fewer than a quarter of all masks remain.
     """
     boxes = projections(bodies, views)
     pairs = [
@@ -112,7 +112,8 @@ def _other_ids(bodies: Bodies, views: RoomViews) -> Trial | None:
 
 
 def _unit_factor(bodies: Bodies, views: RoomViews) -> Trial | None:
-    """Estimate the scale of the translations at which rays through 2D boxes meet their objects."""
+    """Estimate the scale of the translations from rays through 2D boxes, which must meet their
+    objects."""
     height, width = views.image_size
     pairs = np.argwhere(compare(bodies, views).judged)
     if not len(pairs):

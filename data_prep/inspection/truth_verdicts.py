@@ -23,7 +23,7 @@ def disagreement(
     share: float = 1.0,
     least: int = 1,
 ) -> str:
-    """Say that masks and 3D objects disagree, and name the likely cause; without the full stop."""
+    """State that masks and 3D objects disagree, and name the likely cause; no final full stop."""
     tally = agreement.of(kind)
     text = (
         f"{tally.share:.0%} of {tally.masks} masks lie within the projected {KINDS[kind]}, "

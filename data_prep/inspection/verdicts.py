@@ -1,4 +1,4 @@
-"""One verdict from the evidence of rooms: the likeliest mistake, or what was checked."""
+"""Names the likeliest mistake from the evidence of rooms, or else states what was checked."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -12,35 +12,36 @@ from data_prep.inspection.tracking import Trial
 from data_prep.inspection.words import UNITS_M, of_cause, of_ids, of_unit, of_up
 
 _SPARE_AT_LEAST = 12
-"""Spare middles from which on cameras are compared at all."""
+"""Minimum number of spare middles (`Evidence.spare`) for comparing cameras."""
 _MARGIN, _MARGIN_OF_ONE = 0.05, 0.5
-"""A correction must raise the mean agreement by the first, plus the second divided by the square
-root of the spare middles."""
+"""A correction must raise the mean agreement by the first number, plus the second divided by the
+square root of the number of spare middles."""
 _FIT_AT_LEAST = 0.5
-"""Mean agreement below which cameras and masks do not fit. Right rooms reach 0.75 to 0.95, with
-errors of 3 cm and 1.5 degrees 0.7; shuffled cameras 0.2."""
+"""Mean agreement below which cameras and masks do not fit. Correct rooms reach 0.75 to 0.95; with
+errors of 3 cm and 1.5 degrees, 0.7; with shuffled cameras, 0.2."""
 _GOOD = 0.6
-"""Mean agreement that a correction must reach, and below which ids are doubted."""
+"""Mean agreement that a correction must reach, and below which the ids are tested."""
 _NEARNESS = 0.1
-"""Mean correlation below which poses belong to other frames; right rooms have 0.1 to 0.7."""
+"""Mean correlation below which poses belong to other frames; correct rooms have 0.1 to 0.7."""
 _EYES_M, _LENGTHS_M = (0.2, 4.0), (0.15, 6.0)
 """Plausible ranges of the median camera height and of the median length of objects."""
 _SOME_LENGTHS = 3
-"""Minimum number of objects whose lengths are judged: a single one may be badly seen."""
+"""Minimum number of objects for testing lengths: a single object may be badly visible."""
 _FLOOR_M = 0.15
 _ONCE, _SOME_IDS = 0.8, 8
-"""Share of ids in a single view above which ids are not tracked, if there are so many."""
+"""Share of ids that occur in a single view above which ids are not tracked, and the minimum number
+of ids for this test."""
 
 
 class Finding(NamedTuple):
-    """A mistake, by a key that is the same for rooms with the same mistake, and its sentence."""
+    """A mistake: a key that is equal for rooms with the same mistake, and a sentence."""
 
     key: object
     sentence: str
 
 
 def margin(evidence: Evidence) -> float:
-    """Least difference in mean agreement that is no accident."""
+    """Minimum difference in mean agreement that is significant."""
     return _MARGIN + _MARGIN_OF_ONE / max(evidence.spare, 1) ** 0.5
 
 
@@ -57,13 +58,13 @@ def camera_cause(evidence: Evidence) -> Cause | None:
 def find_mistake(
     evidence: Evidence, given: Given, try_tracks: Callable[[], Trial]
 ) -> Finding | None:
-    """The likeliest mistake; `try_tracks` is called only if ids are doubted."""
+    """The likeliest mistake; `try_tracks` is called only if the ids may be wrong."""
     fit = evidence.share(GIVEN)
     if evidence.views <= evidence.rooms:
         return Finding(
             "views",
-            "there is one frame a room, which shows no depth: give at least two, from different "
-            "places, and better twenty",
+            "there is only one frame per room, which shows no depth: give at least two from "
+            "different places, better twenty",
         )
     if evidence.ids >= _SOME_IDS and evidence.once > _ONCE * evidence.ids and evidence.views > 2:
         why = f"{evidence.once} of {evidence.ids} ids are in one image only"
@@ -100,7 +101,7 @@ def _unexplained(evidence: Evidence, given: Given) -> Finding:
 
 
 def _implausible(evidence: Evidence, given: Given) -> Finding | None:
-    """Directions, heights and lengths that masks do not determine, but that are unusual."""
+    """Find an unusual direction, height or length, which masks alone do not determine."""
     axis = int(np.abs(evidence.tops).argmax())
     if abs(evidence.tops[axis]) > 0.5 and evidence.tops[1] <= 0.5:
         return Finding("up", of_up(axis, float(np.sign(evidence.tops[axis])), given))
@@ -129,7 +130,7 @@ def _implausible(evidence: Evidence, given: Given) -> Finding | None:
 
 
 def _metres_per_unit(evidence: Evidence) -> float | None:
-    """Unit of the poses in which furniture is about 0.9 m long; None if none makes it plausible."""
+    """Metres per unit at which furniture is about 0.9 m long; None if no unit is plausible."""
     if evidence.length_m is None:
         return None
     lengths = {factor: evidence.length_m * factor for factor in UNITS_M.values()}
@@ -138,7 +139,7 @@ def _metres_per_unit(evidence: Evidence) -> float | None:
 
 
 def what_was_checked(evidence: Evidence) -> tuple[list[str], list[str]]:
-    """Parts of sentences: errors of cameras that the masks exclude, and those they do not."""
+    """Parts of sentences on the camera errors that masks exclude, and on those they do not."""
     fit, least = evidence.share(GIVEN), margin(evidence)
 
     def excluded(causes: list[Cause]) -> bool:
@@ -147,7 +148,7 @@ def what_was_checked(evidence: Evidence) -> tuple[list[str], list[str]]:
 
     of: dict[str, list[Cause]] = {}
     for cause in evidence.sums:
-        if "sorted" not in cause.detail:  # few frames are sorted in the same way
+        if "sorted" not in cause.detail:  # both orders are equal for few frames
             of.setdefault(cause.family, []).append(cause)
     yes: list[str] = []
     no: list[str] = []

@@ -22,7 +22,7 @@ from sceneprior.core.shard_writing import room_checksum
 from sceneprior.core.shards import Shard, list_shards, read_index
 
 _TRIED_ROOMS = 3
-"""Rooms in which objects are found without ids, or repairs of the ground truth are tried."""
+"""Number of rooms in which objects are found without ids, or ground-truth repairs are tried."""
 _NAMED_ROOMS = 5
 
 
@@ -35,7 +35,7 @@ class RoomCheck:
     views: int = 0
     objects: int = 0
     problems: tuple[str, ...] = ()
-    """Sentences without the room's name."""
+    """Problems as sentences, without the room's name."""
     evidence: Evidence | None = None
     """Evidence about cameras and ids; None if the arrays are faulty."""
     agreement: Agreement = field(default_factory=Agreement)
@@ -52,7 +52,7 @@ class FolderCheck:
     rooms: dict[str, list[RoomCheck]]
     """Rooms by split."""
     problems: tuple[str, ...]
-    """Sentences, each with its place; empty if all is well."""
+    """Problems as sentences, each with its file or room; empty if nothing is wrong."""
 
     @property
     def every(self) -> list[RoomCheck]:
@@ -66,12 +66,12 @@ class FolderCheck:
 
     @property
     def evidence(self) -> Evidence | None:
-        """Evidence of all rooms together; None if there is none."""
+        """Combined evidence of all rooms; None if there is none."""
         return evidence_of(self.every)
 
 
 def evidence_of(checks: Sequence[RoomCheck]) -> Evidence | None:
-    """Evidence of rooms together; None if there is none."""
+    """Combined evidence of rooms; None if there is none."""
     known = [check.evidence for check in checks if check.evidence is not None]
     return total(known) if known else None
 
@@ -107,10 +107,10 @@ def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> Folder
         path = str(folder / room.shard)
         where = path + (f", room {room.room_id}" if room.room_id else "")
         for sentence in room.problems:
-            # Sentences about unreadable shards name their place themselves.
+            # Sentences about unreadable shards already name their file.
             text = sentence if sentence.startswith(path) else f"{where}: {sentence}"
             problems.append(text if text.endswith("?") else f"{text}.")
-    # Without a room's views, a problem already says what is missing.
+    # If a room has no views, one of the problems already states the reason.
     if room_id is None and all(room.views for room in found.every):
         problems += _count_problems(folder, index, rooms)
     problems += _verdict(folder, found.every, usual, given)
@@ -120,8 +120,8 @@ def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> Folder
 def _verdict(
     folder: Path, rooms: Sequence[RoomCheck], usual: Given, given: dict[str, Given]
 ) -> list[str]:
-    """One sentence about cameras and ids of all rooms, or about the rooms that differ; if the
-    masks show no mistake, sentences about the ground truth."""
+    """A sentence on the mistake in the cameras and ids of all rooms, or sentences on the rooms that
+    differ; if there are no such mistakes, sentences on the ground truth."""
 
     def mistake(checks: Sequence[RoomCheck]) -> Finding | None:
         if (evidence := evidence_of(checks)) is None:

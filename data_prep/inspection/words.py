@@ -1,4 +1,4 @@
-"""Sentences that name a mistake in the words of the user's files, and say what to change."""
+"""Sentences that describe a mistake by the user's file and keys, and how to correct it."""
 
 import numpy as np
 
@@ -30,7 +30,7 @@ UNITS_M = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254, "feet": 
 
 
 def of_cause(cause: Cause, given: Given) -> str:
-    """Sentence about a cause in the cameras, without its full stop."""
+    """Sentence on a mistake in the cameras, without a full stop."""
     file = given.file
     keys = " (fl_x, fl_y or camera_angle_x)" if file.endswith(".json") else ""
     if cause.family == "poses":
@@ -103,7 +103,7 @@ def _axes(axes: Axes, reading: str) -> str:
 
 
 def _columns(change: np.ndarray) -> str:
-    """Say how to multiply a matrix's columns by a signed permutation from the right."""
+    """Describe the multiplication of a matrix by a signed permutation of its columns."""
     sources = np.abs(change).argmax(axis=0)
     signs = change[sources, range(3)]
     if (sources == range(3)).all():
@@ -117,7 +117,7 @@ def _columns(change: np.ndarray) -> str:
 
 
 def of_ids(evidence: Evidence, why: str, given: Given) -> str:
-    """Sentence about ids that are not those of objects."""
+    """Sentence on ids that are inconsistent across frames."""
     cure = "pass --tracks auto, which finds the objects" if given.posed else "are they shuffled?"
     return (
         f"the ids of the masks are not those of objects in all frames ({counts(evidence)}; {why}): "
@@ -126,15 +126,15 @@ def of_ids(evidence: Evidence, why: str, given: Given) -> str:
 
 
 def counts(evidence: Evidence) -> str:
-    """Ids an image and images an id."""
+    """Text with the mean number of ids per image, and of images per id."""
     return (
-        f"{evidence.masks / max(evidence.views, 1):.1f} ids an image, "
-        f"{evidence.masks / max(evidence.ids, 1):.1f} images an id"
+        f"{evidence.masks / max(evidence.views, 1):.1f} ids per image, "
+        f"{evidence.masks / max(evidence.ids, 1):.1f} images per id"
     )
 
 
 def of_up(axis: int, sign: float, given: Given) -> str:
-    """Sentence about cameras whose pictures' tops point along another axis of the room."""
+    """Sentence on cameras whose pictures' tops do not point along the room's up axis."""
     along = sign * given.convention.room_from_world[axis, :3]
     place = int(np.abs(along).argmax())
     name = "xyz"[place] if abs(along[place]) > 0.9 and along[place] > 0 else ""
@@ -147,7 +147,7 @@ def of_up(axis: int, sign: float, given: Given) -> str:
 
 
 def of_unit(what: str, found_m: float, bounds: tuple[float, float], factor: float | None) -> str:
-    """Sentence about an implausible size; `factor` is the metres per unit that would mend it."""
+    """Sentence on an implausible size; `factor` is the metres per unit that would correct it."""
     names = {value: name for name, value in UNITS_M.items()}
     cure = "are the poses in metres, and is the floor at the right height?"
     if factor is not None:

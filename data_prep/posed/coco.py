@@ -1,4 +1,4 @@
-"""Reads COCO's JSONs of annotations of many images: single images, tracks of images, and videos.
+"""Reads COCO annotation files (JSON) of single images, of images with tracks, and of videos.
 
 Source: cocodataset.org (data format); the format of YouTube-VIS, whose annotations have one mask
 per frame in `segmentations`; CocoVID and CVAT, whose annotations of images have a track.
@@ -30,7 +30,7 @@ from sceneprior.core.instances.coco import (
 from sceneprior.core.instances.tables import LARGEST_ID
 
 FILES = ("*coco*.json", "instances*.json", "annotations*.json", "annotations/*.json")
-"""Names, as patterns, under which COCO's JSON is looked for in a room's folder."""
+"""Glob patterns of COCO's JSON in a room's folder."""
 _TRACKS = ("track_id", "instance_id")
 
 
@@ -61,7 +61,7 @@ class SegmentedFrames(MaskFormat):
 
     @staticmethod
     def put(frames: dict[str, SegmentedFrame], file_name: str, frame: SegmentedFrame) -> None:
-        """Add a frame, which no other frame's name may equal."""
+        """Add a frame, whose name must be unique."""
         check_size(frame.size, frame.where)
         if frames.setdefault(stem := Path(file_name).stem, frame) is not frame:
             raise InputError(
@@ -119,7 +119,7 @@ class _ImageAnnotation(_Annotation):
 
     @property
     def track(self) -> CocoId | None:
-        """The track, which CVAT puts among the attributes."""
+        """The track id, which CVAT stores among the attributes."""
         attributes = self.attributes if isinstance(self.attributes, dict) else {}
         for key in _TRACKS:
             for value in (getattr(self, key), attributes.get(key)):
@@ -148,7 +148,8 @@ class _Videos(_Coco):
 
 
 class CocoMasks(SegmentedFrames):
-    """The masks of one JSON. Ids are tracked if all annotations have a track, or are of a video."""
+    """The masks of one JSON. Ids are tracked if every annotation has a track or belongs to a
+    video."""
 
     name = "coco"
     title = "a COCO JSON"

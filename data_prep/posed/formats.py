@@ -1,4 +1,4 @@
-"""Formats of `--from`: which tools' poses and masks a room has, guessed from its files."""
+"""Formats of `--from`: the tools that wrote a room's poses and masks, guessed from its files."""
 
 import contextlib
 from collections import Counter
@@ -24,19 +24,19 @@ MASKS = tuple(dict.fromkeys(masks.name for masks in _MASKS))
 
 
 def mask_files(folder: Path) -> list[Path]:
-    """The files of all masks of a room, of whatever format."""
+    """The files of a room's masks in all formats."""
     return sorted({path for masks in _MASKS for path in masks.find(folder)})
 
 
 @dataclass(frozen=True)
 class Formats:
-    """The formats that the user gave with `--from`; None is guessed for each room."""
+    """The formats given with `--from`; a format that is None is guessed for each room."""
 
     poses: str | None = None
     masks: str | None = None
 
     def masks_of(self, folder: Path, label_set_name: str) -> MaskFormat:
-        """The masks of a room; PNGs of ids if it has none, so that these are asked for."""
+        """The masks of a room; if it has none, `IdPngs`, so that the error asks for PNGs of ids."""
         return self._mask_format(folder)(folder, label_set_name)
 
     def _mask_format(self, folder: Path) -> type[MaskFormat]:
@@ -60,7 +60,7 @@ class Formats:
         return (found or [IdPngs])[0]
 
     def found(self, rooms: Iterable[Path]) -> list[str]:
-        """Sentences that name the tools of the rooms, if one of them is guessed."""
+        """Sentences that name the tools of the rooms, if any tool is guessed."""
         if self.poses and self.masks:
             return []
         count: Counter[tuple[str, type[MaskFormat]]] = Counter()

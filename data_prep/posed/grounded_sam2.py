@@ -1,4 +1,4 @@
-"""Reads the masks of Grounded-SAM-2: of its trackers, and of its demos of single images.
+"""Reads the masks that Grounded-SAM-2's trackers and its demos of single images write.
 
 Source: `grounded_sam2_tracking_demo_with_continuous_id.py`, `utils/mask_dictionary_model.py` and
 `grounded_sam2_local_demo.py` in IDEA-Research/Grounded-SAM-2.
@@ -34,7 +34,7 @@ class GroundedSam2(MaskFormat):
     """Tracked ids: `mask_data/mask_<frame>.npy` has the ids of a frame, and
     `json_data/mask_<frame>.json` their classes.
 
-    A class is detected again in each key frame, so it may change; the most frequent one is taken.
+    Classes are detected again in each key frame and may change; the most frequent class is taken.
     """
 
     name = "grounded-sam2"
@@ -98,7 +98,7 @@ def _open(path: Path) -> np.ndarray:
     """An .npy of ids, (height, width), left on disk."""
     try:
         ids = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as error:  # numpy parses the header as Python, whose errors are of any type
+    except Exception as error:  # numpy parses the header as Python, with errors of any type
         raise InputError(
             f"{path} cannot be read as an .npy of numbers ({plain(str(error), 120)}); it may be "
             "truncated: write it again."
@@ -127,7 +127,7 @@ class _Picture(BaseModel):
 class GroundedSam2Images(SegmentedFrames):
     """Ids of single images: the JSON that a demo writes for each picture, in `json_data/`.
 
-    Its `image_path` tells the frame; the JSON's own name does not matter.
+    The key `image_path` identifies the frame; the JSON's file name does not matter.
     """
 
     name = "grounded-sam2"

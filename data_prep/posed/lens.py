@@ -20,7 +20,7 @@ coefficients are not valid there."""
 
 @dataclass(frozen=True)
 class Lens:
-    """Lens distortion by OpenCV's models, of coordinates on the plane at depth 1."""
+    """Lens distortion of coordinates on the plane at depth 1, by OpenCV's models."""
 
     coefficients: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
     """k1, k2, p1, p2, k3 (OPENCV), or k1, k2, k3, k4 (OPENCV_FISHEYE)."""

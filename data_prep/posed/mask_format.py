@@ -1,4 +1,4 @@
-"""Interface of the readers of masks, one for each tool that writes masks."""
+"""Interface for reading masks, implemented for each tool that writes masks."""
 
 from abc import ABC, abstractmethod
 from collections import Counter
@@ -15,16 +15,16 @@ _LISTED = 3
 
 
 class MaskFormat(ABC):
-    """The masks of one room, as one tool writes them.
+    """The masks of one room in one tool's format.
 
-    `folder` is the room's; `label_set_name` decides whether walls and floors are objects, for
-    formats that tell these apart.
+    `folder` is the room's folder. `label_set_name` decides whether walls and floors are objects, in
+    formats that distinguish them from objects.
     """
 
     name: ClassVar[str]
     """Value of `--from`."""
     title: ClassVar[str]
-    """Name and place of the masks, for messages."""
+    """Name of the tool, and files or folders of the masks, for messages."""
 
     def __init__(self, folder: Path, label_set_name: str):
         self.folder, self.label_set_name = folder, label_set_name
@@ -38,7 +38,7 @@ class MaskFormat(ABC):
     @classmethod
     @abstractmethod
     def find(cls, folder: Path) -> list[Path]:
-        """All files that the masks of a room are read from; empty if it has none of this format."""
+        """All mask files of a room; empty if the room has no masks in this format."""
 
     @abstractmethod
     def has(self, frame: PosedFrame) -> bool:
@@ -46,7 +46,8 @@ class MaskFormat(ABC):
 
     @abstractmethod
     def wanted(self, frame: PosedFrame) -> str:
-        """The place where the masks of a frame would be, and what is there instead."""
+        """Description, for messages, of the expected file of a frame's masks, and of what exists
+        instead."""
 
     @abstractmethod
     def size(self, frame: PosedFrame) -> tuple[int, int]:
@@ -66,7 +67,8 @@ class MaskFormat(ABC):
 
 
 def main_classes(of_frames: Iterable[dict[int, str]]) -> tuple[dict[int, str], list[str]]:
-    """The most frequent class of each id over all frames, and a note on ids with several."""
+    """The most frequent class of each id over all frames, and a note on ids with several
+    classes."""
     votes: dict[int, Counter[str]] = {}
     for classes in of_frames:
         for number, name in classes.items():
@@ -82,7 +84,7 @@ def main_classes(of_frames: Iterable[dict[int, str]]) -> tuple[dict[int, str], l
 
 
 def instead(names: Iterable[str]) -> str:
-    """Describe the names that are there where another was expected, if there are any."""
+    """Describe the names that exist where another name was expected, if there are any."""
     listed = [plain(name) for name in sorted(names)]
     return f", but there is {_some(listed)}: give masks the names of their frames" if listed else ""
 

@@ -15,7 +15,7 @@ from sceneprior.core.instances.tables import IdTable
 class MaskPixels:
     """Reads the values of masks, all of one size, undistorted and downsampled.
 
-    `size` is that of all masks, and `stored` that of the downsampled images: (height, width).
+    `size` is the (height, width) of all masks, and `stored` that of the downsampled images.
     """
 
     def __init__(self, masks: MaskFormat, size: tuple[int, int], stored: tuple[int, int]):

@@ -95,8 +95,8 @@ class PanopticIds:
     segments: np.ndarray
     """(n,) segment ids, ascending."""
     of_frame: dict[str, dict[int, str]]
-    """Class of each new id, k + 1 for the k-th segment, in each frame, by the stem of its PNG;
-    stuff is of a class of `STUFF`, or "background"."""
+    """Class by new id (k + 1 for the k-th segment) for each frame, by the stem of the frame's PNG;
+    stuff has a class of `STUFF`, or "background"."""
     stuff: frozenset[str]
     """Classes of stuff that the label set does not have, "background" included."""
 
@@ -137,7 +137,7 @@ class PanopticIds:
 
 
 def read_panoptic(path: Path, label_set_name: str) -> PanopticIds:
-    """Read a room's annotations. Stuff is no object, unless the label set has its class."""
+    """Read a room's annotations. Stuff is not an object, unless the label set has its class."""
     room = checked(_Panoptic, read_json(path), str(path))
     own = {tidy(name) for name in label_set(label_set_name)}
     stuff = frozenset({_BACKGROUND, *STUFF[1:]} - own)

@@ -15,7 +15,7 @@ from sceneprior.core.files import read_json
 from sceneprior.core.instances.checked import checked
 
 KEYFRAMES = ("keyframes/corrected_cameras", "keyframes/cameras")
-"""Folders of optimized poses of undistorted pictures, and of ARKit's poses of the original ones."""
+"""Folders of optimized poses, for undistorted pictures, and of ARKit's poses, for originals."""
 
 
 class _Keyframe(BaseModel):

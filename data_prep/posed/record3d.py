@@ -1,9 +1,9 @@
-"""Reads the poses of a recording of Record3D: the JSON `metadata`.
+"""Reads the poses of a Record3D recording from its JSON `metadata`.
 
 Source: the author's answers in the issues of marek-simonik/record3d (27, 33, 36, 83, 93), and
 `scripts/record3d2nerf.py` in NVlabs/instant-ngp. Poses are camera to world, in metres, with OpenGL
 axes, relative to the first camera, so no axis of their world points up. nerfstudio's reader moves
-the principal point to the middle of the picture; here it is as written.
+the principal point to the image centre; here it stays as written.
 """
 
 from collections.abc import Iterator
@@ -38,7 +38,7 @@ class _Metadata(BaseModel):
 
 
 def record3d_files(folder: Path) -> list[Path]:
-    """The JSON of a recording; empty without one. Only a file that names its poses is taken."""
+    """The JSON of a recording; empty if there is none. A file without poses is ignored."""
     for name in FILES:
         path = folder / name
         if path.is_file() and _POSES in path.read_bytes():
@@ -67,7 +67,7 @@ def read_metadata(path: Path) -> Iterator[tuple[str, np.ndarray, Camera]]:
     for number, (pose, lens) in enumerate(zip(poses, lenses, strict=True)):
         matrix = np.eye(4)
         matrix[:3, 3] = pose[4:]
-        # A quaternion far from length 1 is none; scipy would refuse zeros, and NaN.
+        # A quaternion far from length 1 is invalid; scipy would reject zeros and NaN.
         known = abs(np.linalg.norm(pose[:4]) - 1) < _OFF and np.isfinite(pose).all()
         matrix[:3, :3] = Rotation.from_quat(pose[:4]).as_matrix() if known else np.nan
         fx, fy, cx, cy = lens[:4]

@@ -1,4 +1,4 @@
-"""Contents of a posed room's files in any format: frames with poses, cameras and masks."""
+"""A posed room, independent of its file format: frames with poses, cameras and masks."""
 
 import math
 from dataclasses import dataclass
@@ -89,7 +89,7 @@ class PosedFrame:
 
     @property
     def stem(self) -> str:
-        """Name without folders and ending, under which segmenters store the masks."""
+        """File name without folders and extension, under which segmenters store the masks."""
         return Path(_as_png(self.name)).stem
 
 
@@ -107,7 +107,7 @@ class Recording:
     """Centre of the floor along the two horizontal axes in their order, metres."""
     metres_per_unit: float | None
     up: str = "z"
-    """Axis of the poses' world that points up; `cameras` if none does, as in COLMAP's worlds."""
+    """Axis of the poses' world that points up; `cameras` if no axis does, as in COLMAP's worlds."""
 
 
 def path_text(name: str) -> str:
@@ -124,7 +124,7 @@ def path_text(name: str) -> str:
 def ids_path(folder: Path, name: str) -> Path:
     """Path of a frame's instance-id PNG; `name` is the frame's `file_path`.
 
-    It is `instances/<name without its extension>.png` if that exists (for frames in several
+    The path is `instances/<name without its extension>.png` if that exists (for frames in several
     folders), else `instances/<stem>.png`.
     """
     path = Path(_as_png(path_text(name)))

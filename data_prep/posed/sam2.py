@@ -19,7 +19,7 @@ from sceneprior.core.instances.pngs import mask_size, read_mask
 from sceneprior.core.instances.tables import LARGEST_ID, read_class_table
 
 PLACES = ("masks", ".")
-"""Places of the objects' folders in a room's folder."""
+"""Possible parents of the objects' folders, within a room's folder."""
 
 
 class ObjectFolders(MaskFormat):
@@ -55,7 +55,7 @@ class ObjectFolders(MaskFormat):
 
     @cached_property
     def _stems(self) -> dict[str, list[int]]:
-        """Objects with a mask of each frame."""
+        """Ids of the objects that have a mask in each frame, by the frame's stem."""
         stems: dict[str, list[int]] = {}
         for number, folder in sorted(self._objects.items()):
             for path in folder.glob("*.png"):
@@ -99,7 +99,8 @@ class ObjectFolders(MaskFormat):
 
 
 def _object_folders(room: Path) -> list[Path]:
-    """Folders with a number as name and a PNG in them, in the first of `PLACES` that has any."""
+    """Folders that are named by a number and contain a PNG, in the first of `PLACES` that has
+    any."""
     for place in PLACES:
         folders = [
             path

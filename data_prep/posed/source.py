@@ -33,7 +33,8 @@ class PosedSource:
     label_set: str
     posed_settings: PosedSettings = field(default_factory=PosedSettings)
     test_share: float = 0.1
-    """Share of rooms in the split `test`, at least one of several; 0 puts all rooms in `train`."""
+    """Share of rooms in the split `test`, which gets at least one of several rooms; 0 puts all
+    rooms in `train`."""
     seed: int = 0
     only: str | None = None
     formats: Formats = field(default_factory=Formats)
@@ -42,8 +43,8 @@ class PosedSource:
     def settings(self, only: str | None) -> dict[str, Any]:
         """See `Source.settings`.
 
-        The names and sizes of files are part of the settings, so that the shards of earlier masks
-        or classes are not kept.
+        The names and sizes of files are part of the settings, so that shards of older masks or
+        classes are not reused.
         """
         label_set(self.label_set)
         if not 0 <= self.test_share < 1:
@@ -116,7 +117,7 @@ class PosedSource:
         return self.formats.found(self._rooms())
 
     def assumptions(self) -> list[str]:
-        """Sentences about values that the files lack and that are assumed, to print first."""
+        """Sentences on values that the files lack and that are assumed, printed first."""
         recordings: list[Recording] = []
         untracked: list[str] = []
         for room in self._rooms():
@@ -130,7 +131,7 @@ class PosedSource:
         sentences = []
         if single := sum(len(recording.frames) < 2 for recording in recordings):
             sentences.append(
-                f"{single} of {count} rooms have one frame, which shows no depth: objects are "
+                f"{single} of {count} rooms have only one frame, which shows no depth: objects are "
                 "lifted to 3D from at least two views, better twenty."
             )
         if untracked and settings.tracks != "auto":
@@ -172,7 +173,7 @@ class PosedSource:
             if other := tops.count(axis):
                 sentences.append(
                     f"In {other} of {count} rooms the tops of the pictures point along {axis}, but "
-                    f"{taken} is taken as up: is it --up {axis}?"
+                    f"{taken} is taken as up; should it be --up {axis}?"
                 )
         return sentences
 
@@ -205,7 +206,7 @@ def find_rooms(folder: Path, poses: str | None = None) -> list[Path]:
 
 
 def _look(source: PosedSource, room: Path) -> tuple[int, int] | str:
-    """Size at which a room would be stored, or the reason why it cannot be prepared."""
+    """Image size at which a room would be stored, or the reason why it cannot be prepared."""
     try:
         return stored_size(*source.open(room), source.posed_settings)
     except Exception as error:

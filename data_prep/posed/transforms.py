@@ -3,8 +3,8 @@
 The keys of a JSON are `frames`, camera keys (see Camera) for all frames, `floor_m`,
 `floor_center_m` and `metres_per_unit`. The keys of a frame are `file_path`, `transform_matrix`,
 `instance_path`, `mask_path`, and camera keys, which override the file's. Other keys are ignored,
-and the pictures themselves are never opened. Beside another tool's poses, only the keys of the room
-are read.
+and the pictures themselves are never opened. If the poses come from another tool, only the keys
+about the room are read.
 """
 
 import contextlib
@@ -61,12 +61,12 @@ _IN_METRES = ("polycam", "record3d")
 
 
 def pose_files(folder: Path, given: str | None = None) -> tuple[str, list[Path]]:
-    """Format of a room's poses, and the files that they are read from.
+    """Format of a room's poses, and their files.
 
     The list is empty if the folder is not a room. If `given` is None, the format is guessed:
     transforms.json, or else transforms_*.json (one per split), is preferred to a COLMAP model,
-    beside which nerfstudio writes it. Other tools' poses may have a transforms.json without frames,
-    but with keys about the room.
+    because nerfstudio writes it beside that model. Poses of other tools may come with a
+    transforms.json that has keys about the room but no frames.
     """
     whole = folder / FILE_NAME
     of_room = [whole] if whole.is_file() else []
@@ -145,7 +145,7 @@ def _posed(name: str, files: list[Path]) -> Iterator[tuple[str, np.ndarray, Came
 
 
 def _one(key: str, rooms: list[tuple[Path, _RoomEntry]]) -> Any:
-    """Value of a key that all files of a room with this key must share; None if there is none."""
+    """Value of a key, which all files of a room that have the key must share; None if none has."""
     said = [(path.name, getattr(room, key)) for path, room in rooms]
     said = [(name, value) for name, value in said if value is not None]
     for name, value in said[1:]:

@@ -1,4 +1,4 @@
-"""Reads masks whose ids are not consistent across frames, and finds the objects that they show."""
+"""Reads masks whose ids are inconsistent across frames, and finds the objects that they show."""
 
 import numpy as np
 
@@ -48,7 +48,7 @@ class UntrackedMasks:
             )
         table = IdTable(class_names, self._masks.label_set_name, str(self._masks.folder))
         ids = table.ids(numbers).astype(np.int32)
-        # The table's last id is that of masks without a class. Their content is unknown.
+        # The table's last id stands for masks without a class, whose content is unknown.
         ids[ids == len(table.classes)] = UNKNOWN
         kept = np.unique(ids[ids > 0])
         new_id = np.zeros(len(table.classes) + 1, dtype=np.int32)

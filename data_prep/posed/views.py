@@ -21,8 +21,8 @@ from sceneprior.core.shards import thinned_stuff
 
 TRACKS = ("given", "auto")
 _MANY_IDS, _MANY_FRAMES, _ONCE = 12, 5, 0.8
-"""A room with at least this many ids and frames is refused if more than this share of the ids
-occurs in a single frame only."""
+"""A room with at least these numbers of ids and frames is refused if more than this share of the
+ids occurs in a single frame only."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class PosedSettings:
         for name in ("max_side", "max_views"):
             value = getattr(self, name)
             if value is not None and value < 1:
-                raise InputError(f"{name} is {value}; it counts from 1.")
+                raise InputError(f"{name} is {value}; expected at least 1.")
         for name in ("camera_height_m", "metres_per_unit"):
             if not 0 < getattr(self, name) < float("inf"):
                 raise InputError(f"{name} is {getattr(self, name)}; it must be above 0.")
@@ -145,11 +145,12 @@ def prepare_posed(
 
 
 def _check_tracked(images: np.ndarray, void: int) -> None:
-    """Raise an `InputError` if most ids are in one frame only, as where each frame has its own."""
+    """Raise an `InputError` if most ids occur in one frame only, as if each frame had its own
+    ids."""
     frames_of = np.zeros(void + 1, dtype=np.int64)
     for image in images:
         frames_of[np.unique(image)] += 1
-    frames_of = frames_of[1:void]  # neither the background nor what has no class
+    frames_of = frames_of[1:void]  # without the background and without masks of no class
     count, once = int((frames_of > 0).sum()), int((frames_of == 1).sum())
     if len(images) >= _MANY_FRAMES and count >= _MANY_IDS and once > _ONCE * count:
         raise InputError(
@@ -161,7 +162,7 @@ def _check_tracked(images: np.ndarray, void: int) -> None:
 def _unsaid_floor(
     seen: Observations, upright: np.ndarray, intrinsics: np.ndarray, settings: PosedSettings
 ) -> tuple[float, str]:
-    """Estimate or assume the height of an unknown floor; a note states the origin of the height."""
+    """Estimate or assume the height of an unknown floor; also return a note on its origin."""
     lowest = float(upright[:, 1, 3].min())
     found = find_floor(seen, room_cameras(upright, np.eye(4)), intrinsics)
     if found is not None and found[0] < lowest:

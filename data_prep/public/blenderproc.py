@@ -62,7 +62,7 @@ class BlenderProc(Reader):
 
     name: ClassVar = "blenderproc"
     recipe: Recipe
-    """Its classes and room types; the other rules would need the house files."""
+    """Recipe for classes and room types; its other rules would need the house files."""
 
     @property
     def label_set(self) -> str:
@@ -102,7 +102,7 @@ class BlenderProc(Reader):
             areas = Counter[str]()
             for part in parts:
                 areas[part.room_id] += int(pixels[part.idx]) if part.idx < len(pixels) else 0
-            if areas := +areas:  # those of furniture that is visible
+            if areas := +areas:  # keeps the areas of visible furniture
                 room = max(sorted(areas), key=lambda name: areas[name])
                 frames.setdefault(room, []).append(path.name)
         return {

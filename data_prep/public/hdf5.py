@@ -1,4 +1,4 @@
-"""Reads arrays of other programs' HDF5 files, with one sentence for whatever is wrong with them."""
+"""Reads arrays from other programs' HDF5 files, and reports any fault in one sentence."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,7 +9,7 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.instances.checked import plain
 
 _MOST_VALUES = 64 << 20
-"""Largest number of values of an array; images and trajectories have far fewer."""
+"""Maximum number of values in an array; images and trajectories have far fewer."""
 
 
 def read_hdf5(path: Path, names: Sequence[str], hint: str) -> list[np.ndarray]:

@@ -1,4 +1,4 @@
-"""Reads Hypersim: synthetic scenes with trajectories of cameras, which may be tilt-shift ones.
+"""Reads Hypersim: synthetic scenes with camera trajectories; cameras may be tilt-shift.
 
     <folder>/metadata_camera_parameters.csv     projection of each scene (contrib/mikeroberts3000)
     <folder>/<scene>/_detail/metadata_scene.csv meters_per_asset_unit
@@ -154,7 +154,7 @@ def _metres_per_unit(path: Path) -> float:
 
 
 def _trajectories(scene: Path, unit: float) -> tuple[list[tuple[Path, Path]], np.ndarray]:
-    """Paths of the images of ids and of classes of all frames, and camera to world in metres."""
+    """Paths of each frame's id image and class image, and camera-to-world matrices in metres."""
     images: list[tuple[Path, Path]] = []
     poses: list[np.ndarray] = []
     for folder in sorted((scene / "_detail").glob("cam_*")):
@@ -191,7 +191,7 @@ def _image(path: Path, size: tuple[int, int]) -> np.ndarray:
 
 
 def _boxes(folder: Path, unit: float) -> dict[int, np.ndarray]:
-    """Boxes by instance + 1, in metres with y up, of the instances that have a valid one."""
+    """Boxes in metres with y up, by instance + 1, for instances with a valid box."""
     positions, axes, extents = (
         read_hdf5(folder / _BOXES.format(name), ("dataset",), _HINT)[0]
         for name in ("positions", "orientations", "extents")

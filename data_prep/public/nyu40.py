@@ -1,4 +1,4 @@
-"""NYU40 classes: by id, for data sets with images of NYU40 ids, and by free labels."""
+"""NYU40 classes by id, for data sets with images of NYU40 ids, and by free-text label."""
 
 import numpy as np
 
@@ -32,7 +32,7 @@ LIKE_NYU40 = {
     "refrigerator": "refridgerator", "fridge": "refridgerator", "bath tub": "bathtub",
     "blackboard": "whiteboard", "washbasin": "sink",
 }  # fmt: skip
-"""NYU40 class of common free labels, such as those of ScanNet++."""
+"""NYU40 class of common free-text labels, such as those of ScanNet++."""
 
 
 def ids_and_classes(
@@ -40,9 +40,9 @@ def ids_and_classes(
 ) -> tuple[np.ndarray, dict[int, str], np.ndarray]:
     """Combine images of instance ids (-1 = none) with images of NYU40 ids (0 or less = none).
 
-    An instance has the class of most of its pixels, over all images. A pixel without an instance
-    is background if its class is a part of the room, and unknown otherwise. An instance that is
-    a part of the room is background, too.
+    An instance has the class of most of its pixels, over all images. A pixel without an instance is
+    background if its class is a part of the room, and unknown otherwise. Instances that are parts
+    of the room are also background.
 
     Returns:
         Images of numbers, int32 of the same shape: instance + 1, 0 for background, -1 for unknown;

@@ -41,7 +41,8 @@ class FramedRoom:
     intrinsics: np.ndarray
     """(3, 3), or (views, 3, 3), in pixels of `ids`."""
     boxes: dict[int, np.ndarray] = field(default_factory=dict)
-    """Points of objects, (P, 3), such as the corners of oriented boxes, as far as known."""
+    """Points, (P, 3), such as the corners of an oriented box, of each object for which they are
+    known."""
     floor_y: float | None = None
     """Height of the floor; None takes the lowest point of the visible objects' boxes."""
     floor_m: np.ndarray | None = None
@@ -56,7 +57,7 @@ class FramedRoom:
 
 @dataclass(frozen=True)
 class FoundRoom:
-    """A room that a scene's folder holds."""
+    """A room found in a scene's folder."""
 
     image_size: tuple[int, int]
     """(height, width) of its images of ids, before they are shrunk."""
@@ -66,7 +67,7 @@ class FoundRoom:
 
 @dataclass(frozen=True)
 class Reader(ABC):
-    """Knows the files of one data set."""
+    """Reads the files of one data set."""
 
     name: ClassVar[str]
     """Name of the data set in `index.json`."""
@@ -89,7 +90,7 @@ class Reader(ABC):
 
     @abstractmethod
     def scenes(self) -> list[str]:
-        """Names of the scenes' folders, sorted; rooms of one scene are in one split."""
+        """Sorted names of the scene folders. All rooms of a scene are in the same split."""
 
     def official_split(self, scene: str) -> str | None:
         """Split of a scene, if the data set states it in the scene's name."""
@@ -97,11 +98,11 @@ class Reader(ABC):
 
     @abstractmethod
     def rooms(self, scene: str) -> dict[str, FoundRoom]:
-        """Rooms of a scene by id: the scene's name, or that with `_` and the room's."""
+        """Rooms of a scene by id, which is `<scene>` or `<scene>_<room>`."""
 
     @abstractmethod
     def read(self, task: RoomTask, max_side: int | None, max_views: int) -> FramedRoom:
-        """Read one room with at most so many views, its images shrunk to `max_side`."""
+        """Read one room with at most `max_views` views, and shrink its images to `max_side`."""
 
 
 def sampled(
@@ -131,8 +132,8 @@ def chosen_frames(
 def prepare_room(room_id: str, room: FramedRoom, label_set_name: str) -> PreparedRoom | None:
     """Label the views of a room; None if no view shows an object of the label set.
 
-    The ground truth has the boxes of all objects with a class and a box. Without the box of a
-    visible object there is no ground truth.
+    The ground truth has the boxes of all objects with a class and a box. If a visible object has no
+    box, there is no ground truth.
     """
     names = {tidy(name) for name in label_set(label_set_name)} - {"void"}
     if not names & {tidy(name) for name in room.classes.values()}:
@@ -210,7 +211,7 @@ def _truth(
     corners = np.array([boxes[table.objects[k]] for k in order]) - origin
     centers_m, sizes_m = corners.mean(axis=1), corners[:, 1] - corners[:, 0]
     places = np.zeros((len(order), 4, 4))
-    places[:, range(3), range(3)] = sizes_m  # from the unit cube, for want of a model
+    places[:, range(3), range(3)] = sizes_m  # from the unit cube, since there are no models
     places[:, :3, 3], places[:, 3, 3] = centers_m, 1
     return RoomGroundTruth(
         object_class=table.classes[order],

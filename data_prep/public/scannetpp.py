@@ -7,7 +7,8 @@
 
 Meshes are in metres, z up. COLMAP's models and `aligned_pose` of the iPhone are in the mesh's
 world; nerfstudio's files have OpenGL's camera axes, in a world whose x and y are swapped and whose
-z is reversed. Masks are those of a pinhole without distortion: no pixel of a picture is read.
+z is reversed. Masks are rendered for a pinhole without distortion; the pictures themselves are not
+read.
 
 Source: common/scene_release.py, common/utils/anno.py, semantic/transforms/mesh.py and
 iphone/arkit_pcl.py of scannetpp/scannetpp; its issue 160, and nerfstudio's colmap_to_json.
@@ -46,10 +47,10 @@ from sceneprior.render.offscreen.zbuffer import rasterize
 TABLE = "scannetv2-labels.combined.tsv"
 _IPHONE = "iphone/pose_intrinsic_imu.json"
 _IPHONE_SIZE = (1440, 1920)
-"""(height, width) of the iPhone's pictures, which its file does not give."""
+"""(height, width) of the iPhone's pictures, which its file does not state."""
 _FROM_NERFSTUDIO = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
 _OUTSIDE_M = 1.0
-"""Distance from the mesh's bounding box from which on a camera is outside of the scene."""
+"""Distance from the mesh's bounding box beyond which a camera is outside the scene."""
 _MESH = "scans/mesh_aligned_0.05.ply"
 
 
@@ -166,7 +167,7 @@ def _cameras(scene: Path) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
 def _in_mesh(
     path: Path, mesh_from_world: np.ndarray, images: list[tuple[np.ndarray, dict[str, Any]]]
 ) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
-    """Result of `_cameras`, from camera to world with OpenGL's axes, and keys of cameras."""
+    """Result of `_cameras`, from camera-to-world matrices with OpenGL's axes and camera keys."""
     lenses, size = [], (0, 0)
     for pose, keys in images:
         if keys.get("w") is None or keys.get("h") is None:
@@ -184,7 +185,7 @@ def _in_mesh(
 
 
 def _labels(folder: Path) -> Labels:
-    """NYU40 classes of labels: of ScanNet's table, if it is there, and of ours."""
+    """NYU40 classes of labels, from ScanNet's table, if it exists, and from ours."""
     table = folder / TABLE
     own = {name: name for name in label_set(LABEL_SET)[1:]} | LIKE_NYU40
     listed = read_labels(table).nyu40 if table.is_file() else {}
@@ -211,7 +212,7 @@ def _ids(
 
 
 def _most_common(corners: np.ndarray) -> np.ndarray:
-    """Value that most corners of a face have, (F,); the first corner's if all differ."""
+    """Value of the majority of each face's corners, (F,); the first corner's if all differ."""
     first, second, third = corners.T
     return np.where(second == third, second, first)
 
@@ -219,6 +220,6 @@ def _most_common(corners: np.ndarray) -> np.ndarray:
 def _nearest_faces(
     mesh: Mesh, world_to_camera: np.ndarray, K: np.ndarray, image_size: tuple[int, int]
 ) -> np.ndarray:
-    """Image of the nearest faces' indices; -1 where there is none."""
+    """Image of the nearest faces' indices; -1 where there is no face."""
     projection = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
     return rasterize(mesh.vertices_m, mesh.faces, world_to_camera, projection, image_size)[0]

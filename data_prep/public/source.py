@@ -1,4 +1,4 @@
-"""Source for public data sets: one class for all of them, over the reader of each."""
+"""The `Source` of all public data sets, on top of a reader for each data set."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -67,7 +67,7 @@ class PublicSource:
     expected: ClassVar[Expected | None] = None
     reader: Reader
     splits: Path | None = None
-    """CSV of `room or scene,split`; None takes the data set's own split by the scene's number, or
+    """CSV of `room or scene,split`; None takes the data set's official split or, without one,
     splits the scenes 9:1 by the seed."""
     max_side: int | None = 480
     """Maximum side of stored images in pixels."""
@@ -93,7 +93,7 @@ class PublicSource:
         for name in ("max_side", "max_views"):
             value = getattr(self, name)
             if value is not None and value < 1:
-                raise InputError(f"{name} is {value}; it counts from 1.")
+                raise InputError(f"{name} is {value}; expected at least 1.")
         sizes = {"max_side": self.max_side, "max_views": self.max_views}
         return {
             "recipe": {**sizes, **self.reader.settings()},

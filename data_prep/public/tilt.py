@@ -1,4 +1,4 @@
-"""Turns the projections of tilt-shift cameras into those of pinhole cameras."""
+"""Converts projections of tilt-shift cameras to projections of pinhole cameras."""
 
 import numpy as np
 from scipy.linalg import rq
@@ -10,8 +10,8 @@ def pinhole(cam_from_uv: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray,
     """Split a projection of Hypersim into intrinsics, with skew, and a rotation of the camera.
 
     `cam_from_uv` (3, 3) maps (u, v, 1), both in [-1, 1] with v upwards, to a ray in OpenGL's camera
-    axes. A tilted image plane is that of a pinhole camera which is turned: any invertible matrix
-    is an upper triangular one times a rotation.
+    axes. A camera with a tilted image plane equals a rotated pinhole camera, since any invertible
+    matrix is an upper triangular matrix times a rotation.
 
     Returns:
         Intrinsics, (3, 3), pixel centres at i + 0.5; and the rotation, (3, 3), from OpenCV's axes
@@ -38,8 +38,8 @@ def straight_grid(
     """Remove the skew of `intrinsics` by shifting the rows of an image.
 
     An image plane that is tilted about both axes has a skewed pixel grid, which shards cannot
-    store: u = fx * x / z + skew * y / z + cx. Row by row, each pixel takes the value of the pixel
-    that lies where the skew puts it.
+    store: u = fx * x / z + skew * y / z + cx. Within its row, each pixel takes the value of the
+    pixel to which the skew moves it.
 
     Args:
         lines: Rows (h, 1) and columns (1, w) of an image of `size`, (height, width).

@@ -89,7 +89,7 @@ def read_groups(path: Path) -> tuple[list[Group], list[str]]:
 
 def read_segments(path: Path) -> np.ndarray:
     """Read the segment of each mesh vertex from `<scene>_vh_clean_2...segs.json`: (V,) int64."""
-    why = "it tells which part of the mesh is which object"
+    why = "it assigns the parts of the mesh to objects"
     return np.array(_read_json(_Segmentation, path, why).segIndices, dtype=np.int64)
 
 

@@ -16,7 +16,7 @@ from sceneprior.core.instances.pngs import png_kind
 MASK_FILES = {"filt": "_2d-instance-filt.zip", "raw": "_2d-instance.zip"}
 """Suffix of the archive's name, after the scan's, for each value of `--masks`."""
 _LARGEST_MEMBER_BYTES = 64 << 20
-"""Size limit of a mask; one of 1296 x 968 has some 10 KB, or 1.2 MB uncompressed."""
+"""Size limit of a mask; a mask of 1296 x 968 pixels has some 10 KB, or 1.2 MB uncompressed."""
 
 
 class MaskArchive:

@@ -6,8 +6,8 @@ from data_prep.scannet.scans import Scan
 from sceneprior.render.offscreen.zbuffer import NEAR_PLANE_M, rasterize
 
 _BEHIND_M = 0.05
-"""Depth difference from which on a vertex behind the rendered surface counts as occluded; smaller
-ones occur at borders between objects."""
+"""Minimum depth of a vertex behind the rendered surface to count as occluded; smaller depths occur
+at borders between objects."""
 _CUT_SHARE = 0.005
 """Tolerance of the sides of the 2D box, relative to the image's longer side."""
 

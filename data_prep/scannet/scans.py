@@ -54,7 +54,7 @@ class ScanSettings:
             raise InputError(f"masks is '{self.masks}'; choose {' or '.join(MASK_FILES)}.")
         for name in ("frame_step", "max_views"):
             if getattr(self, name) < 1:
-                raise InputError(f"{name} is {getattr(self, name)}; it counts from 1.")
+                raise InputError(f"{name} is {getattr(self, name)}; expected at least 1.")
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class Scan:
 
     @property
     def scan_id(self) -> str:
-        """Id of the scan, such as `scene0000_00`; each scan of a space is a room of its own."""
+        """Id of the scan, such as `scene0000_00`; each scan of a space is a separate room."""
         return self.folder.name
 
 

@@ -12,7 +12,7 @@ from sceneprior.core.errors import InputError
 VERSION = 4
 _COLOR_KINDS, _DEPTH_KINDS = (-1, 0, 1, 2), (-1, 0, 1, 2)
 _LONGEST_SIDE_PX = 1 << 16
-"""Image sizes from here on mean a damaged file: the data set has none so large."""
+"""Image size from which a file counts as damaged; the data set has no such images."""
 _FRAME = struct.Struct("<16f4Q")
 """Header of a frame: camera_to_world; timestamps and byte counts of colour and depth."""
 _AFTER_CALIBRATION = struct.Struct("<2i4IfQ")
@@ -44,7 +44,7 @@ def read_recording(path: Path) -> Recording:
     Source: ScanNet's SensReader (sensorData.h), version 4.
     """
     try:
-        # Unbuffered, because a buffer would read 100 KB around every header.
+        # The file is unbuffered, because a buffer would read 100 KB around every header.
         file = path.open("rb", buffering=0)
     except OSError as error:
         raise InputError(
@@ -131,7 +131,7 @@ class _Reader:
         """Check that bytes `start` to `start + size` lie inside the file."""
         left = max(self.size - start, 0)
         if size > left:
-            # A negative size, read as unsigned, is a very large one and ends here, too.
+            # A negative size, read as unsigned, is very large and also ends here.
             raise InputError(
                 f"{self._where(frame, start)}: {what} should take {size} bytes, but {left} are "
                 "left; the file is truncated or damaged. Download it again."

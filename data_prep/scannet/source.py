@@ -37,7 +37,8 @@ class ScanNetSource:
     scan_settings: ScanSettings = field(default_factory=ScanSettings)
     train: Path | None = None
     val: Path | None = None
-    """The official lists; `val` is the split `test`. None splits the spaces 9:1 by the seed."""
+    """The official lists; `val` becomes the split `test`. None splits the spaces 9:1 by the
+    seed."""
     seed: int = 0
     only: str | None = None
 
@@ -60,7 +61,7 @@ class ScanNetSource:
                 name: None if path is None else digest(Path(path).read_text(encoding="utf-8"))
                 for name, path in lists.items()
             },
-            # Only names, not file sizes, so that a failed scan can be downloaded again and retried
+            # Names without file sizes, so that a failed scan can be downloaded again and retried
             # (`--retry-failed`) in the same folder.
             "scans": digest("\n".join(path.name for path in folders)),
         }
@@ -100,7 +101,8 @@ class ScanNetSource:
         return made
 
     def _turned(self, scan: Scan, made: PreparedRoom, labels: Labels) -> PreparedRoom:
-        """Prepare a scan again along its walls, if these do not lie along its axes."""
+        """Prepare a scan again, aligned with its walls, if the walls are not aligned with the
+        axes."""
         degrees = find_turn(made.views)
         if degrees:
             scan = read_scan(scan.folder, labels, self.scan_settings, degrees)
@@ -121,8 +123,8 @@ class ScanNetSource:
         return chosen
 
 
-# Cached from room to room within a process; the stamp makes long-lived workers reread a changed
-# table.
+# The table is cached from room to room within a process; the stamp makes long-lived workers reread
+# a changed table.
 @functools.lru_cache(maxsize=1)
 def _labels(path: Path, stamp: int) -> Labels:
     return read_labels(path)

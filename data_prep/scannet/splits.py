@@ -10,8 +10,8 @@ from sceneprior.core.errors import InputError
 def find_scans(folder: Path) -> list[Path]:
     """Find the scan folders in ScanNet's `scans`, sorted.
 
-    A scan folder is named like `scene0000_00` or holds a `.sens` of its own name. It is listed even
-    if its `.sens` is missing, so that the report mentions it.
+    A scan folder is named like `scene0000_00` or holds a `.sens` with the folder's name. A folder
+    is listed even if its `.sens` is missing, so that the report mentions it.
     """
     folder = Path(folder)
     if not folder.is_dir():

@@ -54,7 +54,7 @@ def prepare_scan(scan: Scan) -> PreparedRoom | None:
     labels = [*(item.label for item in scan.instances), "void"]
     classes = np.array([names.index(label) for label in labels], dtype=np.int16)
     seen = observe(images, classes)
-    del images  # `seen` has its own
+    del images  # `seen` has its own images
     if not len(seen.tracked):
         return None
     notes = scan.notes

@@ -1,4 +1,4 @@
-"""Weights of pairs of masks: log-odds that two masks show one object."""
+"""Weights of pairs of masks: log-odds that both masks show the same object."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -7,15 +7,15 @@ SAME, OTHER = 0.75, 0.08
 """Probability that a cell shown by one mask is also shown by the other mask, for two masks of the
 same object and of different objects."""
 STRENGTH, ENOUGH = 4.0, 10.0
-"""Weight of a pair's geometry, and the number of cells at which 63% of this weight is reached: the
-cells of a surface are not independent observations."""
+"""Maximum weight of a pair's geometry, and number of cells at which 63% of it is reached; the
+weight saturates because a surface's cells are not independent observations."""
 CLASS_ERROR = 0.05
-"""Assumed share of wrong classes."""
+"""Assumed share of masks with a wrong class."""
 SAME_VIEW = -4.0
-"""Weight of two masks of one view: an object has one mask in a view, unless the mask is split."""
+"""Weight of two masks in the same view: an object has one mask per view, unless it is split."""
 ID_MEANS = 0.3
-"""Ids are used if this share of the pairs in a cluster has equal ids, and the share among pairs of
-different clusters is below this part of it."""
+"""Ids are used if at least this share of the pairs within clusters has equal ids, and if the share
+among pairs of different clusters is below this multiple of the former."""
 
 
 def pair_weights(
@@ -25,10 +25,13 @@ def pair_weights(
 ) -> Float[np.ndarray, "masks masks"]:
     """Weight of each pair of masks, from the cells that the views of both masks see.
 
-    Of the n cells that mask a shows and the view of b sees, the share q is shown by b. The
-    log-odds q log(SAME / OTHER) + (1 - q) log((1 - SAME) / (1 - OTHER)) are computed in both
-    directions, averaged, and weighted by STRENGTH (1 - exp(-n / ENOUGH)). The log-odds of equal or
-    unequal classes are added, with the same weight but for STRENGTH. `shown` is that of `Surface`.
+    Mask a shows n cells that b's view also sees, and b shows the share q of these. The log-odds
+
+        q log(SAME / OTHER) + (1 - q) log((1 - SAME) / (1 - OTHER))
+
+    are computed in both directions, averaged, and weighted by STRENGTH (1 - exp(-n / ENOUGH)). The
+    log-odds of equal or unequal classes are added, with the same weight but without STRENGTH.
+    `shown` is that of `Surface`.
     """
     count = len(mask_view)
     member = np.zeros((len(shown), count + 1), dtype=np.float32)
@@ -50,8 +53,8 @@ def pair_weights(
 
 
 def class_odds(mask_class: Int[np.ndarray, " masks"], error: float) -> tuple[float, float]:
-    """Log-odds that two things show one object, if their classes are equal and if they are not;
-    `error` is the probability that the classes of one object differ."""
+    """Log-odds that two masks or clusters show the same object, if their classes are equal and if
+    they differ; `error` is the probability that the classes of one object differ."""
     frequency = np.bincount(mask_class) / len(mask_class)
     agree = float((frequency**2).sum())
     return float(np.log((1 - error) / agree)), float(np.log(error / (1 - agree + 1e-3)))
@@ -62,8 +65,9 @@ def id_odds(
     labels: Int[np.ndarray, " masks"],
     mask_view: Int[np.ndarray, " masks"],
 ) -> Float[np.ndarray, "masks masks"] | None:
-    """Log-odds that masks show one object, from their given ids; None if ids are not consistent
-    across views. The error rates of ids are measured in clusters that were found without them."""
+    """Log-odds that masks show the same object, from their given ids; None if the ids are
+    inconsistent across views. The error rates of ids are measured in clusters that were found
+    without ids."""
     other_view = mask_view[:, None] != mask_view
     same_id, same = given[:, None] == given, labels[:, None] == labels
     if not (other_view & same).any() or not (other_view & ~same).any():

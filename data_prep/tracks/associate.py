@@ -1,11 +1,11 @@
-"""Finds the objects that masks of single frames show, from cameras, masks and classes alone.
+"""Groups the masks of single frames by object, using only cameras, masks and classes.
 
-Masks are clustered by correlation clustering (`clusters.py`): it maximises the sum, over pairs of
-masks in one cluster, of the log-odds that both show one object (`affinity.py`), measured at the
-grid cells that both views see. Clustering alternates with space carving (Kutulakos and Seitz, "A
-theory of shape by space carving", IJCV 2000), which compares clusters in place of colours: a cell
-in which views see different clusters, or background, is emptied. At the end, masks that share few
-cells with others join the cluster whose visual hull explains them (`leftovers.py`).
+Correlation clustering (`clusters.py`) maximises the sum, over pairs of masks in the same cluster,
+of the log-odds that both show the same object (`affinity.py`), measured at the grid cells that both
+views see. Clustering alternates with space carving (Kutulakos and Seitz, "A theory of shape by
+space carving", IJCV 2000), which compares clusters instead of colours: a cell in which views see
+different clusters, or background, is emptied. At the end, masks that share few cells with others
+join the cluster whose visual hull explains them (`leftovers.py`).
 """
 
 from typing import NamedTuple
@@ -22,16 +22,17 @@ from data_prep.tracks.rays import Surface, first_hits, surface, votes_of, widene
 from data_prep.tracks.voxels import Grid, cameras_of, fill
 
 STEP = 3
-"""Step between the rows and columns that are used, for an image whose longer side is 480 pixels;
+"""Step between the rows and columns used, for images whose longer side is 480 pixels; the step is
 proportional to that side."""
 ROUNDS, STRICT = 7, 2
-"""Rounds of clustering and carving; from round STRICT on, cells need two views that agree."""
+"""Number of rounds of clustering and carving, and the round from which cells need two views that
+agree."""
 AGREE = 0.45
-"""Share of the views of a filled cell that must show one cluster there."""
+"""Minimum share of a filled cell's views that must show the same cluster."""
 SPLIT = (3, 5)
 """Rounds in which merged masks are split."""
 JOINS = 4
-"""Largest number of passes in which small clusters join larger ones."""
+"""Maximum number of passes in which small clusters join larger ones."""
 UNKNOWN = -1
 """Pixel value where the content is unknown."""
 
@@ -71,8 +72,8 @@ def associate(
 
     Args:
         world_to_camera: Poses with OpenCV axes, in metres; the direction of up does not matter.
-        given: The masks' original ids. If they are consistent across views (`id_odds`), they are
-            used as evidence, and no mask is split: right ids stay as they are, others are repaired.
+        given: The masks' original ids. If the ids are consistent across views (`id_odds`), they are
+        used as evidence, and no mask is split: correct ids are kept, others are repaired.
     """
     if not len(masks.mask_class):
         return Tracks(np.minimum(masks.ids, 0), masks.mask_class)
@@ -98,7 +99,7 @@ def _labels(
     intrinsics: np.ndarray,
     odds: np.ndarray | None = None,
 ) -> tuple[FrameMasks, Int[np.ndarray, " masks"]]:
-    """The masks after merged ones are split, and the cluster of each.
+    """The masks, after merged masks are split, and each mask's cluster.
 
     `odds`, (masks, masks), are the log-odds of `id_odds`, added to the weights of pairs. With them,
     masks are neither split nor joined by hulls.

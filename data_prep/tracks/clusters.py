@@ -1,8 +1,8 @@
-"""Clusters of masks with the greatest sum of the weights of all pairs in one cluster.
+"""Clusters masks so that the sum of the weights of all pairs within clusters is maximal.
 
 Correlation clustering (Bansal et al., "Correlation clustering", Machine Learning 2004): a positive
-weight says that two masks show one object, a negative one that they do not. The number of clusters
-is not given. Greedy contraction of pairs and moves of single masks alternate until neither
+weight means that two masks show the same object, a negative weight that they do not. The number of
+clusters is not given. Greedy contraction of pairs and moves of single masks alternate until neither
 increases the sum (Keuper et al., "Efficient decomposition of image and mesh graphs by lifted
 multicuts", ICCV 2015).
 """
@@ -51,7 +51,7 @@ def _contract(weights: np.ndarray, labels: np.ndarray) -> np.ndarray:
         between[:, one] = between[one]
         between[other] = between[:, other] = -np.inf
         between[one, one] = -np.inf
-        # Rows whose best partner has changed.
+        # Update the rows whose best partner has changed.
         stale = np.flatnonzero((best == one) | (best == other))
         for row in {one, other, *stale.tolist()}:
             best[row] = between[row].argmax()
@@ -88,6 +88,6 @@ def _move(weights: np.ndarray, labels: np.ndarray) -> np.ndarray:
 
 
 def _renumbered(labels: np.ndarray) -> np.ndarray:
-    """The same clusters, numbered in the order of their first masks."""
+    """Renumber clusters in the order of their first masks."""
     _, first, back = np.unique(labels, return_index=True, return_inverse=True)
     return np.argsort(np.argsort(first))[back]

@@ -1,4 +1,4 @@
-"""Share of each mask's rays that pass through the visual hull of each cluster of masks."""
+"""Computes the share of each mask's rays that pass through each cluster's visual hull."""
 
 from typing import no_type_check
 
@@ -10,10 +10,9 @@ from data_prep.tracks.rays import cell_at, direction_of, ids_at, span_of, votes_
 from data_prep.tracks.voxels import Cameras, Grid
 
 LEAST_VIEWS = 2
-"""Smallest number of views, other than the mask's own, that show the cluster in a cell of its
-hull."""
+"""Minimum number of views, other than the mask's, that must show the cluster in a hull cell."""
 PAST = 0.3
-"""Largest share of views that see past a cell of a hull; half a view more is allowed."""
+"""Maximum share of views that see past a hull cell; half a view is added to the limit."""
 EVERY = 2
 """Step between the rows and columns whose rays are followed."""
 
@@ -25,10 +24,10 @@ def explained(
     cameras: Cameras,
     grid: Grid,
 ) -> Float[np.ndarray, "masks clusters"]:
-    """Share of the rays of each mask that meet the hull of each cluster.
+    """Share of each mask's rays that meet each cluster's hull.
 
     A cell is in the hull if at least two views show the cluster there and few see background.
-    Masks of other clusters are no evidence, since they may be in front. The hull of a mask's own
+    Masks of other clusters do not count, since they may be in front. The hull of a mask's own
     cluster is computed without the mask's view. `near` are the ids after `widened`.
     """
     cells = np.argwhere(grid.filled)
@@ -56,8 +55,8 @@ def _in_hull(
 @njit(cache=True, nogil=True)
 @no_type_check
 def _follow(ids, labels, eyes_m, rays, low_m, cell_m, row_of_cell, hulls, hulls_without):
-    """Rays of each mask that meet each cluster's hull, and all rays of each mask;
-    `hulls_without` are the hulls with a view less."""
+    """Numbers of each mask's rays that meet each cluster's hull, and of all its rays;
+    `hulls_without` are the hulls computed without one view."""
     views, height, width = ids.shape
     clusters = hulls.shape[1]
     met, count = np.zeros((len(labels), clusters)), np.zeros(len(labels))

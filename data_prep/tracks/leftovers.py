@@ -9,10 +9,10 @@ from data_prep.tracks.clusters import main_classes
 ENOUGH = 0.6
 """Share of a mask's rays that must meet a cluster's hull for the hull to favour joining."""
 HULL, CLASS, PAIRS, SAME_VIEWS = 4.0, 1.0, 2.0, -2.0
-"""Weights of hulls, of classes, of the mean weight of pairs, and of common views."""
+"""Weights of the terms of the gain: hulls, classes, mean pair weight, and common views."""
 FEW = 6.0
-"""Gain of joining a cluster of one mask to any other, since most objects are seen more often; a
-cluster of n masks gains a part n of it."""
+"""Gain of joining a cluster of one mask to any other cluster, since most objects are visible more
+often; for a cluster of n masks, the gain is divided by n."""
 
 
 def join_leftovers(
@@ -22,17 +22,16 @@ def join_leftovers(
     mask_view: Int[np.ndarray, " masks"],
     mask_class: Int[np.ndarray, " masks"],
 ) -> Int[np.ndarray, " masks"]:
-    """Join each cluster, the smallest first, to the larger cluster with the largest gain, if that
-    is positive.
+    """Join each cluster, the smallest first, to the larger cluster with the largest positive gain.
 
-    The gain is the sum of
+    With the mean share s of the smaller cluster's rays that meet the larger cluster's hull, the
+    gain is the sum of
 
-    - HULL times the excess over `ENOUGH` of the mean share of the smaller cluster's rays that meet
-      the larger one's hull (scaled to 0 to 1; three times as steep below),
+    - HULL times (s - ENOUGH) / (1 - ENOUGH) if s is above ENOUGH, else HULL times 3 (s - ENOUGH),
     - CLASS times the log-odds of the classes,
-    - PAIRS times the mean weight of pairs of different views,
+    - PAIRS times the mean weight of pairs of masks in different views,
     - SAME_VIEWS times the share of the smaller cluster's views that show both clusters, and
-    - FEW divided by the number of the smaller cluster's masks.
+    - FEW divided by the smaller cluster's number of masks.
     """
     count = int(labels.max()) + 1
     size = np.bincount(labels, minlength=count)

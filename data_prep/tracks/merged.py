@@ -1,4 +1,4 @@
-"""Splits masks that show several objects, where the other views tell the objects apart."""
+"""Splits masks that show several objects, if other views distinguish these objects."""
 
 import numpy as np
 from jaxtyping import Int
@@ -9,15 +9,15 @@ from data_prep.tracks.rays import Surface, votes_of, widened
 from data_prep.tracks.voxels import Cameras, Grid
 
 LEAST_CELLS = 4
-"""Smallest number of cells that each part of a mask shows."""
+"""Minimum number of cells that each part of a mask must show."""
 SHOWN = 0.5
-"""Smallest share of a cluster's cells, among those that the view sees, that the part shows."""
+"""Minimum share, shown by the part, of those cells of its cluster that the view sees."""
 PART = 0.03
-"""Smallest share of a mask's cells in each part."""
+"""Minimum share of a mask's cells in each part."""
 OTHERS = 2
-"""Views, other than the mask's own, that must agree on the cluster of a cell."""
+"""Number of views, other than the mask's, that must agree on a cell's cluster."""
 OWN, OTHER = 0.75, 0.6
-"""Largest share of a part's rays that meet the hull of the mask's cluster, and smallest share that
+"""Maximum share of a part's rays that meet the hull of the mask's cluster, and minimum share that
 meet the hull of the part's cluster."""
 SPECK = 5e-4
 """Share of an image that a part, or a cluster of one mask, must exceed."""
@@ -35,16 +35,16 @@ def split_merged(
     cameras: Cameras,
     grid: Grid,
 ) -> tuple[Int[np.ndarray, "views rows columns"], Split]:
-    """Cut masks of several clusters into parts.
+    """Cut masks that show several clusters into parts.
 
-    A part is kept if the hull of its cluster explains it and the hull of the mask's cluster, which
-    may hide behind the part, does not.
+    A part is kept if its rays meet the hull of its own cluster, but not the hull of the mask's
+    cluster, which might be behind the part.
 
     Args:
-        full: Images of ids, whose every `step`-th row and column belongs to `cameras`.
+        full: Images of ids at full size; `cameras` sees every `step`-th row and column.
 
     Returns:
-        The images, and the pairs whose parts were kept: part k has the k-th id after the last.
+        The images, and the pairs whose parts are kept: part k gets the k-th id after the last.
     """
     split = find_merged(seen.shown, labels, mask_view)
     if not split:
@@ -68,10 +68,10 @@ def find_merged(
     labels: Int[np.ndarray, " masks"],
     mask_view: Int[np.ndarray, " masks"],
 ) -> Split:
-    """Find masks that show a second cluster, which has no mask of its own in their view.
+    """Find masks that show a second cluster, which has no separate mask in their view.
 
-    Most of the cluster's cells that the view sees must lie in this mask, by the other views, and
-    the mask must show cells of its own cluster, too.
+    According to the other views, most of the cluster's cells that the view sees must lie in this
+    mask; the mask must also show cells of its own cluster.
     """
     votes = votes_of(shown, labels)
     present = np.zeros((votes.shape[1], shown.shape[1]), dtype=bool)
@@ -81,7 +81,7 @@ def find_merged(
         inside = shown[:, view] == mask + 1
         if inside.sum() < 2 * LEAST_CELLS:
             continue
-        # All cells that the view sees, without this mask's own vote.
+        # Take all cells that the view sees, without this mask's own vote.
         rows = np.flatnonzero(shown[:, view] >= 0)
         others = votes[rows].copy()
         others[inside[rows], own] -= 1
@@ -105,8 +105,8 @@ def cut(
     cameras: Cameras,
     grid: Grid,
 ) -> Int[np.ndarray, "views rows columns"]:
-    """Images of ids in which each part of a mask has an id of its own. A pixel belongs to the part
-    of the nearest projected cell."""
+    """Images of ids in which each part of a mask has a separate id. A pixel belongs to the part of
+    the nearest projected cell."""
     full = full.copy()
     votes = votes_of(seen.shown, labels)
     number = len(labels)

@@ -1,4 +1,4 @@
-"""First filled cells on the rays of masks, and the ids that the views show at cells."""
+"""Finds the first filled cells on the rays of masks, and the ids that views show at cells."""
 
 from typing import NamedTuple, no_type_check
 
@@ -10,14 +10,15 @@ from scipy import ndimage
 from data_prep.tracks.voxels import Cameras, Grid, centre_of, pixel_of
 
 WIDEN_PX = 1.5
-"""Sampled pixels by which masks are widened before views are compared, since outlines, cells and
-poses are not exact."""
+"""Number of sampled pixels by which masks are widened before views are compared, since outlines,
+cells and poses are not exact."""
 BEHIND = 1.5
-"""Cells by which a cell may lie behind the first one of a ray and still count as seen."""
+"""Number of cell edges by which a cell may lie behind the first cell of a ray and still count as
+visible."""
 
 
 class Surface(NamedTuple):
-    """Cells that are the first filled one on some ray."""
+    """Cells that are the first filled cell on some ray."""
 
     cells: Int[np.ndarray, "cells 3"]
     shown: Int[np.ndarray, "cells views"]
@@ -82,7 +83,7 @@ def votes_of(
 @njit(cache=True, nogil=True)
 @no_type_check
 def direction_of(rays, row, column):
-    """World direction, of depth 1, of the ray of a pixel's centre."""
+    """World direction, scaled to depth 1, of the ray through a pixel's centre."""
     u, v = column + 0.5, row + 0.5
     x = rays[0, 0] * u + rays[0, 1] * v + rays[0, 2]
     y = rays[1, 0] * u + rays[1, 1] * v + rays[1, 2]

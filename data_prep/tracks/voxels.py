@@ -1,7 +1,7 @@
-"""Cells of a room's grid that its masks may show, and the projection of cells into the views.
+"""Finds the cells of a room's grid that masks may show, and projects cells into the views.
 
-A cell is kept if enough views see a mask there rather than background: the visual hull of all
-objects together, tolerant of missing masks. Masks need no identities for this.
+A cell is kept if enough views see a mask there rather than background. The result is the visual
+hull of all objects together, tolerant of missing masks and independent of their ids.
 """
 
 from typing import NamedTuple, no_type_check
@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from numba import njit
 
 BEYOND_M = 3.0
-"""Largest distance of objects from the cameras' bounding box."""
+"""Maximum distance of objects from the cameras' bounding box."""
 COARSE_M, FINE = 0.32, 4
 """Edge length of the coarse cells, and number of fine cells along it (8 cm each)."""
 MISSED = 0.12
@@ -26,7 +26,7 @@ MIN_DEPTH_M = 0.1
 
 
 class Cameras(NamedTuple):
-    """Pinhole cameras of images that hold every `step`-th pixel."""
+    """Pinhole cameras of images that keep every `step`-th pixel."""
 
     to_image: Float[np.ndarray, "views 3 4"]
     """Intrinsics times `world_to_camera`, metres to pixels of the sampled images."""
@@ -37,7 +37,7 @@ class Cameras(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """Filled cells between two corners, indexed x, y, z."""
+    """Grid of filled and empty cells between two corners, indexed x, y, z."""
 
     low_m: Float[np.ndarray, "3"]
     cell_m: float
@@ -62,7 +62,7 @@ def cameras_of(
 
 
 def fill(ids: Int[np.ndarray, "views height width"], cameras: Cameras) -> Grid:
-    """Find the cells that masks show, first on a coarse grid, then on a fine one.
+    """Find the cells that masks show, first on a coarse grid, then on a fine grid.
 
     `ids` are 0 for background, -1 for unknown content, and positive for masks.
     """
@@ -130,8 +130,9 @@ def pixel_of(matrix, point, height, width):
 def _is_filled(cells, low_m, cell_m, to_image, eyes_m, rays, focal_px, masks, known, coarse):
     """True for cells whose log-odds of being filled are positive, and that two views see filled.
 
-    `masks` and `known` are summed-area tables of the pixels of masks and of all but background. A
-    coarse cell is seen filled if any mask lies in its outline, a fine one by its centre's pixel.
+    `masks` is the summed-area table of mask pixels, `known` that of mask and unknown pixels. A view
+    sees a coarse cell filled if any mask lies in the cell's outline, and a fine cell if a mask lies
+    at the pixel of the cell's centre.
     """
     views, height, width = masks.shape[0], masks.shape[1] - 1, masks.shape[2] - 1
     seen_filled = np.log((1 - MISSED) / (1 - BACKGROUND))

@@ -1,1 +1,1 @@
-"""User-facing code: the Python API, the command line, the viewer, packed priors, comparisons."""
+"""User-facing code: Python API, command line, viewer, packed priors and comparisons."""

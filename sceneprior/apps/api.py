@@ -1,4 +1,4 @@
-"""The Python API, on which the commands are built: load a trained prior and make rooms with it."""
+"""The Python API, used by the commands: load a trained prior and generate rooms with it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -59,8 +59,8 @@ class Prior:
 
     @cached_property
     def origin(self) -> dict[str, str]:
-        """What the rooms of the prior say of it in their `extra`: its name (`prior`), its version
-        (`prior_version`, if its file is known; see `version_of`) and the version of the package
+        """The provenance that rooms carry in `extra`: the prior's name (`prior`), the prior's
+        version (`prior_version`, if its file exists; see `version_of`) and the package's
         (`sceneprior`).
 
         Examples:
@@ -70,12 +70,12 @@ class Prior:
         """
         try:
             version = {"prior_version": version_of(weights_of(self.where))}
-        except (InputError, OSError):  # deleted since, or never in a file
+        except (InputError, OSError):  # the file was deleted, or there was none
             version = {}
         return {"prior": name_of(self.where), **version, "sceneprior": __version__}
 
     def _told(self, rooms: Sequence[Scene], **more: Any) -> list[Scene]:
-        """The rooms with their origin in `extra`, before what is there."""
+        """Rooms with `origin` and `more` added at the start of `extra`."""
         return [replace(room, extra={**self.origin, **more, **room.extra}) for room in rooms]
 
     def __repr__(self) -> str:
@@ -114,9 +114,9 @@ class Prior:
             distribution: `sampler`, or a distribution of latents: `paper` or `kernel`.
             floor: Requested floor: `"4x3"` (metres along x and z), a list of corners [x, z], or
                 a file with a floor.
-            openings: Requested doors and windows: `"door,window@north"`, or a list.
-            ceiling_m: Requested height of the ceiling.
-            want: Wishes: a sentence, or numbers of objects by class, such as
+            openings: Requested doors and windows, such as `"door,window@north"`, or a list.
+            ceiling_m: Requested height of the ceiling. want: Wishes: a sentence, or numbers of
+            objects by class, such as
                 `{"nightstand": 2, "desk": 0}`.
             objects: Objects that are already in the room, in the coordinates of the floor.
             cad: Replace decoded meshes by the most similar models of the package's own furniture
@@ -126,7 +126,7 @@ class Prior:
         lists each wish, and whether the room fulfils it.
 
         Raises:
-            InputError: the prior has no such distribution, or no room holds the request.
+            InputError: the prior has no such distribution, or no room can satisfy the request.
 
         Examples:
             >>> prior = load("procthor-bedroom")
@@ -226,8 +226,8 @@ class Prior:
         asked = {key: value for key, value in asked.items() if value is not None}
         if asked and classes is not None:
             raise InputError(
-                f"The classes to add are listed, and the request has {', '.join(sorted(asked))}; "
-                "name the classes among its wishes (want) instead."
+                "`classes` lists the classes to add, but the request also has "
+                f"{', '.join(sorted(asked))}; name the classes in its wishes (want) instead."
             )
         if asked or (classes is None and _has_walls(scene)):
             own: dict[str, Any] = {"objects": scene.objects}
@@ -255,7 +255,7 @@ class Prior:
         Args:
             images: Images from shards (`image_from_shards`) or files (`read_own_image`).
             fit: `objects` fits object by object; `paper` fits a latent to each image.
-            restarts: Latents fitted to each image.
+            restarts: Number of latents fitted to each image.
 
         Raises:
             InputError: the images have another label set, or the prior lacks the latents.
@@ -265,7 +265,7 @@ class Prior:
         return reconstruct(self.trained, images, FitOptions(fit, restarts))
 
     def latent(self, point: Point) -> Float[Tensor, " dimension"]:
-        """The latent of an end of `interpolate`.
+        """The latent of a room, given like an end of `interpolate`.
 
         Raises:
             InputError: the point is not a latent of this prior.
@@ -295,7 +295,7 @@ class Prior:
 
     @property
     def with_latents(self) -> TrainedPrior:
-        """`trained`, with an InputError if it has no latent space."""
+        """Return `trained`; raise InputError if it has no latent space."""
         return with_latents(self.trained, self.where)
 
 

@@ -48,8 +48,8 @@ def load_config(name: str, overrides: tuple[str, ...] = ()) -> RunConfig:
 def check_config(data: dict[str, Any], source: str) -> RunConfig:
     """Turn plain data into the config of its method; an error is a ConfigError of one sentence.
 
-    Runs and packed priors of earlier versions have a section `samples`, which chose checkpoints. It
-    is dropped if it has no effect (`every` is 0 or missing), and refused otherwise.
+    Runs and packed priors of earlier versions have a section `samples`, which chose checkpoints.
+    The section is dropped if it has no effect (`every` is 0 or missing), and refused otherwise.
     """
     if "method" not in data and "stages" in data:
         raise ConfigError(

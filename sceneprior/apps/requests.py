@@ -1,4 +1,4 @@
-"""Files of requests, and requests whose floor is in a file of another program."""
+"""Read requests from JSON, and requested floors from files of other programs."""
 
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -80,8 +80,8 @@ def load_request(path: str | Path) -> dict[str, Any]:
 
 
 def with_floor_of_file(asked: dict[str, Any]) -> dict[str, Any]:
-    """Replace the name of a file in a request by the floor that the file holds. Doors, windows and
-    ceiling are taken from the file, too, unless the request has its own.
+    """Replace a file name given as the floor of a request by the floor in that file. Doors, windows
+    and ceiling are also taken from the file, unless the request has its own.
 
     Raises:
         InputError: the file has no floor.

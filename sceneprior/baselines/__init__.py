@@ -1,1 +1,1 @@
-"""Baselines that the paper is compared with, learnt from 2D or 3D supervision."""
+"""Baselines for comparison with the paper's method, trained with 2D or 3D supervision."""

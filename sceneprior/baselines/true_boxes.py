@@ -23,7 +23,7 @@ from sceneprior.training.method import TrainedSampler, ready_copy
 
 
 class TruthDataset(RoomDataset):
-    """The boxes of all furniture in the rooms of a split, in memory, visible to a camera or not.
+    """The boxes of all furniture in a split's rooms, visible to a camera or not, held in memory.
 
     Rows and rotations are those of `ViewDataset`. With rotations, each row is mirrored in every
     second epoch, so that two epochs contain the eight symmetries of each room.

@@ -1,1 +1,1 @@
-"""Evaluation of generated and reconstructed rooms: metrics, protocol, tables, the page."""
+"""Evaluation of generated and reconstructed rooms: metrics, protocol, tables and report pages."""

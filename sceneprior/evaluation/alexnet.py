@@ -49,7 +49,7 @@ def classify_pictures(
         ATISS (Paschalidou et al., NeurIPS 2021), whose classifier the paper uses.
     """
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    # Forked, so that the caller's random numbers do not depend on this call.
+    # The random state is forked, so that the caller's random numbers do not depend on this call.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         network = _network(_weights(path)).to(device)

@@ -1,4 +1,4 @@
-"""Top-down pictures of a set of rooms, and the networks' features of them."""
+"""Renders top-down pictures of rooms, and computes network features of the pictures."""
 
 import hashlib
 import os
@@ -44,7 +44,7 @@ are not kept: 1,000 rooms would take 0.8 GB.
 
 @dataclass(frozen=True)
 class Drawing:
-    """Settings for drawing and reading pictures, the same for every set of rooms."""
+    """Settings for rendering pictures and computing features, the same for every set of rooms."""
 
     label_set: str
     inception: Path | None = None
@@ -80,7 +80,7 @@ class Drawing:
         protocol, stream = topdown_protocol(self.label_set), iter(scenes)
         parts: list[Features] = []
         waiting: deque[Future[Features]] = deque()
-        # The processors that this process may use, not all of the machine's.
+        # Count the processors that this process may use, not all of the machine's.
         known = hasattr(os, "sched_getaffinity")
         processors = len(os.sched_getaffinity(0)) if known else os.cpu_count() or 1
         efficientnet_lite0()  # loaded once, before the threads start

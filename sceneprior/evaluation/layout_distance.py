@@ -25,10 +25,10 @@ TURNS = tuple(
 def layout_distance(a: Scene, b: Scene) -> float:
     """Mean cost, in metres, of moving and resizing one room's furniture to match the other's.
 
-    Objects are paired one to one within classes at the least total cost. A pair costs the norm of
-    (difference of centres, difference of sizes), at most 1 m; an object without a partner costs
-    1 m. The total is divided by the number of objects in the larger room: 0 for equal layouts, 1
-    for layouts without a common object. Two empty rooms are at distance 0.
+    Objects are paired one to one within classes at minimum total cost. A pair costs the norm of
+    (difference of centres, difference of sizes), at most 1 m; an object without a partner costs 1
+    m. The total is divided by the number of objects in the larger room: 0 for equal layouts, 1 for
+    layouts without a common object. Two empty rooms are at distance 0.
 
     Example: one of two chairs moved by 30 cm.
 
@@ -78,10 +78,9 @@ def nearest_distances(
     be compared with is inf.
 
     Args:
-        pass_over_own: Skip the training room that has the scene's name, so that a training room is
-            not compared with itself.
-        as_copies: Compare only with rooms of the same furniture, up to one object more or fewer,
-            and average over the pairs alone: the unpaired object costs nothing.
+        pass_over_own: Skip the training room that has the scene's name, so that no training room is
+        compared with itself. as_copies: Compare only with rooms of the same furniture, up to one
+        object more or fewer, and average over pairs only: an unpaired object costs nothing.
     """
     rooms = _Rooms(training)
     names = np.array([room.name for room in training])
@@ -158,8 +157,8 @@ def _turned(rows: np.ndarray, turn: np.ndarray) -> np.ndarray:
 def _lower_bounds(costs: np.ndarray, starts: np.ndarray, counts: np.ndarray) -> np.ndarray:
     """Lower bound on the total cost to each training room: each object's cheapest partner."""
     mine = len(costs)
-    # `reduceat` needs a column at each start, also that of an empty last room. The column added
-    # for it falls into the last room, so it adds 0 to a sum and never lowers a minimum.
+    # `reduceat` needs a column at each start, even if the last room is empty. The extra column
+    # belongs to the last room, where it adds 0 to the sum and never lowers a minimum.
     cheapest = np.append(costs.min(0, initial=MISSING_M), 0.0)
     theirs = np.add.reduceat(cheapest, starts) * (counts > 0)
     ours = np.minimum.reduceat(np.hstack([costs, np.full((mine, 1), MISSING_M)]), starts, axis=1)
@@ -184,7 +183,7 @@ class Nearest(NamedTuple):
     none of these rooms holds the same furniture."""
 
     def of(self, rows: Sequence[int]) -> "Nearest":
-        """The distances of some of the rooms."""
+        """The distances of the rooms `rows`."""
         picked = [None if part is None else part[list(rows)] for part in self]
         return Nearest(*picked)  # type: ignore[arg-type]
 

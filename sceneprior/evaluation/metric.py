@@ -27,10 +27,10 @@ with the real meshes (the same layouts, other pictures)."""
 EACH_SET = ("test", *AGAINST_TEST)
 GENERATED = ("generated",)
 USED = ("test", "shuffled", "independent", "generated")
-"""Sets for which metrics of use are computed."""
+"""Sets for which metrics of use (see use.py) are computed."""
 Counts = Mapping[str, tuple[float | int, float | int]]
-"""For one room, the numerator and denominator of metrics of use, by key. A metric of a set is the
-ratio of their sums over rooms; a denominator of 0 leaves a room out."""
+"""Numerator and denominator of each metric of use for one room, by key. The metric of a set is the
+ratio of their sums over rooms; a room with denominator 0 is left out."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Comparison:
     """Seed of the classifiers' folds."""
     alexnet: Path | None
     plausible_pairs: Bool[np.ndarray, "classes classes"]
-    """True for pairs of classes that intersect in real rooms too (`plausible_pairs`)."""
+    """True for pairs of classes that also intersect in real rooms (`plausible_pairs`)."""
     near_copy_m: float
     """Distance to a training room with the same furniture below which a room is a near copy."""
     columns: dict[str, dict[str, Estimate]] = field(default_factory=dict)

@@ -18,7 +18,7 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.threads import single_threaded
 
 CHUNK = 2
-"""Images per forward pass, as many as fit the caches of two cores. The last chunk is padded with
+"""Images per forward pass, chosen to fit the caches of two cores. The last chunk is padded with
 black images, so that every image passes through the same kernels and its features do not depend on
 the number of images."""
 

@@ -51,7 +51,7 @@ USE: tuple[Metric, ...] = tuple(
     for module in (collisions, bounds, support, navigation, clearance, voxel_loss, stability)
     for metric in module.METRICS
 )
-"""Metrics of use of rooms: their functions take one scene, and compute its `Counts`."""
+"""Metrics of use; their functions compute the `Counts` of one scene."""
 
 
 def definitions(names: str, alexnet: Path | None) -> dict[str, Any]:

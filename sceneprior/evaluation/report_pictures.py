@@ -30,7 +30,7 @@ class RoomPictures:
     contents: str
     """The scene's objects in words: "double bed, nightstand ×2"."""
     topdown: str
-    """Data URI of the flat top-down picture, with borders and in quiet colours, at half size."""
+    """Data URI of the flat top-down picture, with borders and in muted colours, at half size."""
     perspective: str
     """Data URI of the shaded view from above a corner."""
     glb: str

@@ -103,7 +103,7 @@ def draw_rooms(
         }
         for group in sorted(set(groups) - set(drawn)):
             drawn[group] = draw(group.replace("_", " "), groups[group])
-        # Read again with meshes, so that all training meshes are in memory only for this line.
+        # Rooms are read again with meshes, so that all training meshes are in memory only here.
         furnished = independent_rooms(reference_scenes(shards, "train"), count, rooms.seed, True)
         drawn["independent_meshes"] = draw("independent, furnished", furnished)
         del furnished

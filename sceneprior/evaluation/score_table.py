@@ -60,7 +60,7 @@ def relation_rows(scores: dict[str, Any]) -> list[tuple[str, ...]]:
 
 
 def headings(scores: dict[str, Any]) -> list[tuple[str, str]]:
-    """(title, number of rooms) of each of `COLUMNS` that the result has."""
+    """(title, number of rooms) of those `COLUMNS` that the result has."""
     protocol = scores.get("protocol", {})
     titles = COLUMNS | {"test": f"real {protocol.get('split', 'test')}"}
     return [(titles[name], f"{protocol[f'n_{name}']} rooms") for name in _sets(scores)]

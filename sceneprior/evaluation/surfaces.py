@@ -1,4 +1,4 @@
-"""Surfaces of objects for metrics of use: rays, points inside, triangles that meet, and voxels."""
+"""Geometry of object surfaces for metrics of use: rays, points inside, intersections, voxels."""
 
 from typing import NamedTuple
 
@@ -13,26 +13,26 @@ Triangles = Float[np.ndarray, "_ 3 3"]
 Points = Float[np.ndarray, "_ 3"]
 
 FLUSH_M = 1e-3
-"""Distance beyond the floor up to which furniture is flush with the wall: scenes give the outlines
-of floors to the millimetre."""
+"""Distance beyond the floor up to which furniture counts as flush with the wall: floor outlines are
+given to the millimetre."""
 AT_ONCE = 1_000_000
-"""Largest number of pairs that are compared in one array."""
+"""Maximum number of pairs compared in one array."""
 
 
 def own_box(item: SceneObject) -> Turned:
-    """The object's oriented box if it is known, else its axis-aligned box as one."""
+    """The object's oriented box; if its yaw is unknown, its axis-aligned box with yaw 0."""
     return item.turned or Turned(0.0, item.size_m)
 
 
 def footprint(item: SceneObject) -> Float[np.ndarray, "4 2"]:
-    """Corners (x, z) of the object's own box on the floor, in order."""
+    """Corners (x, z) of the object's `own_box` on the floor, in order."""
     yaw_rad, size_m, _ = own_box(item)
     corners = np.array([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]]) / 2 * np.asarray(size_m)
     return np.asarray((corners @ yaw_rotation(yaw_rad).T + np.asarray(item.center_m))[:, ::2])
 
 
 def triangles_of(item: SceneObject) -> Triangles:
-    """Triangles of the object's mesh; without a mesh, of its own box."""
+    """Triangles of the object's mesh or, if it has none, of its `own_box`."""
     if item.mesh is not None:
         return np.asarray(item.mesh.vertices_m, dtype=np.float64)[item.mesh.faces]
     yaw_rad, size_m, _ = own_box(item)
@@ -56,12 +56,12 @@ def area_centroid(triangles: Triangles) -> Float[np.ndarray, "3"]:
 
 
 class Crossings(NamedTuple):
-    """Points of triangles above or below given points, on the vertical lines through these."""
+    """Intersections of triangles with the vertical lines through given points."""
 
     point: Int[np.ndarray, " crossings"]
     """Index of the given point."""
     height_m: Float[np.ndarray, " crossings"]
-    """Height (y) of the triangle there."""
+    """Height (y) of the intersection."""
     side: Int[np.ndarray, " crossings"]
     """1 if the triangle faces up there, -1 if it faces down."""
 
@@ -87,7 +87,8 @@ def _crossings(points: Points, rows: Int[np.ndarray, " some"], triangles: Triang
     inside = np.zeros((len(rows), len(triangles)), dtype=bool)
     for a, b in ((0, 1), (1, 2), (2, 0)):
         ax, az, bx, bz = (triangles[:, k, axis] for k in (a, b) for axis in (0, 2))
-        # The edge is crossed by the half-line towards +x; both ways of writing it agree exactly.
+        # The half-line towards +x crosses the edge; swapping makes both directions of an edge agree
+        # exactly.
         swap = az > bz
         ax, bx = np.where(swap, bx, ax), np.where(swap, ax, bx)
         az, bz = np.where(swap, bz, az), np.where(swap, az, bz)
@@ -108,8 +109,8 @@ def _crossings(points: Points, rows: Int[np.ndarray, " some"], triangles: Triang
 def inside(points: Points, triangles: Triangles) -> Bool[np.ndarray, " points"]:
     """True for points inside a surface: their winding number, counted along +y, is not 0.
 
-    Closed parts that overlap, as in most models of furniture, count as their union. Of a surface
-    with holes, points above or below a hole may be missed.
+    Closed parts that overlap, as in most furniture models, count as their union. If the surface has
+    holes, points above or below a hole may be missed.
     """
     found = vertical_crossings(points, triangles)
     above = found.height_m > points[found.point, 1]
@@ -118,7 +119,7 @@ def inside(points: Points, triangles: Triangles) -> Bool[np.ndarray, " points"]:
 
 
 def meeting_pairs(a: Triangles, b: Triangles) -> Int[np.ndarray, "pairs 2"]:
-    """Indices of triangles of a and b that meet, in one point at least, by separating axes."""
+    """Index pairs of triangles of a and b that share a point, found by the separating axis test."""
     low, high = np.maximum(bounds(a)[0], bounds(b)[0]), np.minimum(bounds(a)[1], bounds(b)[1])
     rows = np.flatnonzero(((a.min(axis=1) <= high) & (a.max(axis=1) >= low)).all(axis=1))
     columns = np.flatnonzero(((b.min(axis=1) <= high) & (b.max(axis=1) >= low)).all(axis=1))
@@ -134,7 +135,7 @@ def meeting_pairs(a: Triangles, b: Triangles) -> Int[np.ndarray, "pairs 2"]:
 
 
 def _separated(a: Triangles, b: Triangles) -> Bool[np.ndarray, " pairs"]:
-    """True for pairs of triangles with one of 17 axes on which they do not overlap."""
+    """True for pairs of triangles that one of 17 axes separates."""
     a_sides, b_sides = (np.roll(each, -1, axis=1) - each for each in (a, b))
     a_normal, b_normal = (np.cross(each[:, 0], each[:, 1])[:, None] for each in (a_sides, b_sides))
     crossed = np.cross(a_sides[:, :, None], b_sides[:, None]).reshape(len(a), 9, 3)
@@ -150,7 +151,7 @@ def _separated(a: Triangles, b: Triangles) -> Bool[np.ndarray, " pairs"]:
 
 
 def edge_hits(a: Triangles, b: Triangles) -> Points:
-    """Points in which edges of one triangle of each pair pass through the other triangle."""
+    """Points where an edge of one triangle of a pair passes through the other triangle."""
     found = [np.zeros((0, 3))]
     for edges, faces in ((a, b), (b, a)):
         sides = faces[:, 1:] - faces[:, :1]
@@ -179,7 +180,7 @@ class Voxels(NamedTuple):
 
 
 def voxelize(triangles: Triangles, pitch_m: float) -> Voxels:
-    """The cells that a surface passes through, and those that they enclose.
+    """Cells that a surface passes through or encloses.
 
     Points on the surface, at most half a pitch apart, are rounded to cells, as in trimesh's
     `voxelized(pitch).fill()`, which divides triangles until their edges are that short.
@@ -188,7 +189,7 @@ def voxelize(triangles: Triangles, pitch_m: float) -> Voxels:
 
     longest = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2).max(axis=1)
     steps = np.maximum(np.ceil(longest / (pitch_m / 2)), 1)
-    # Powers of two, so that there are few different grids.
+    # Steps are powers of two, so that there are few distinct grids.
     steps = 2 ** np.ceil(np.log2(steps)).astype(np.int64)
     low, high = np.round(bounds(triangles) / pitch_m).astype(np.int64)
     grid = np.zeros(high - low + 1, dtype=bool)

@@ -1,4 +1,5 @@
-"""Metrics of use of sets of rooms: collisions, support, free floor, doors, volumes, stability."""
+"""Metrics of use, which test whether rooms suit simulation: collisions, support, free floor, doors,
+volumes, stability."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,7 +24,7 @@ from sceneprior.evaluation.room_sets import without_void
 from sceneprior.evaluation.synthesis import FORMAT, VERSION, EvalOptions, result_of
 
 SETTLED = ("solids", "all", "none")
-"""Rooms that are simulated: those whose objects have solids or no meshes, all, or none."""
+"""Choices of rooms to simulate: those whose objects all have solids or no mesh; all; or none."""
 
 
 @dataclass(frozen=True)
@@ -34,9 +35,10 @@ class UseOptions:
     """Rooms that are simulated, one of `SETTLED`. A mesh without solids is divided into convex
     parts first, which takes up to two minutes for one object with 3,000 triangles."""
     alone: bool = False
-    """Compute no other metrics."""
+    """Compute the metrics of use only."""
     stand: bool = False
-    """Set down, give feet to and move apart the objects of generated rooms first (`stand`)."""
+    """First make the objects of generated rooms stand, by setting them down, adding feet and moving
+    them apart (`stand`)."""
 
     def __post_init__(self) -> None:
         if self.settle not in SETTLED:
@@ -51,7 +53,7 @@ class Used:
 
     columns: dict[str, dict[str, Estimate]]
     left_out: dict[str, str]
-    """What generated rooms lack, by key."""
+    """For each metric left out, what the generated rooms lack."""
 
 
 def measure_use(
@@ -59,8 +61,8 @@ def measure_use(
 ) -> Used:
     """Compute all metrics of use for sets of rooms, with intervals over rooms.
 
-    A metric that no generated room has what it needs for (a floor, doors or windows) is left out of
-    all sets, with the reason.
+    A metric is left out of all sets, with the reason, if no generated room has what it needs (a
+    floor, doors or windows).
     """
     columns = {}
     total = sum(map(len, sets.values()))
@@ -71,7 +73,7 @@ def measure_use(
             for scene in scenes:
                 measured.append(measure_room(scene, options))
                 bars.advance(bar)
-            # Far from the numbers of the sets that `room_sets` resamples.
+            # These seeds are far from those of `room_sets`.
             counts = resample_counts(len(scenes), resamples, (seed, 100 + number))
             columns[name] = {metric.key: _estimate(metric.key, measured, counts) for metric in USE}
     missing = [key for key, found in columns["generated"].items() if found.value is None]
@@ -83,7 +85,7 @@ def measure_use(
 
 
 def measure_room(scene: Scene, options: UseOptions) -> Counts:
-    """Numerators and denominators of all metrics of use of one room."""
+    """Numerators and denominators of all metrics of use, for one room."""
     found: dict[str, tuple[float | int, float | int]] = {}
     functions: dict[Callable[..., Any], None] = dict.fromkeys(metric.function for metric in USE)
     for function in functions:
@@ -138,14 +140,14 @@ def evaluate_use(
     shards: Path | None = None,
     scores: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Measure the use of generated rooms and, with shards, of real, shuffled and random rooms.
+    """Compute metrics of use for generated rooms and, with shards, for real and random rooms.
 
     Args:
         shards: Shards with 3D ground truth; None measures the generated rooms alone.
         scores: A result of the same rooms that is to be extended; a new one if None.
 
     Returns:
-        A result as of `evaluate_synthesis`, with the metrics of use.
+        A result in the format of `evaluate_synthesis`, with the metrics of use.
     """
     generated = [without_void(scene) for scene in generated]
     if not generated:

@@ -22,7 +22,7 @@ from sceneprior.evaluation.metrics.mesh_metrics import (
 from sceneprior.render.topdown import object_mesh
 
 RESAMPLES = 1000
-"""Bootstrap resamples of rooms behind an interval."""
+"""Number of bootstrap resamples of rooms per interval."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def score_pair(pair: ObjectPair, points: int = POINTS, seed: int = 0) -> PairSco
         for part in (item.center_m, item.size_m)
     )
     box_iou, class_right = float(box_iou_3d(*boxes)[0, 0]), found.label == truth.label
-    if truth.mesh is None:  # against a box, a correct shape would score worse than a box
+    if truth.mesh is None:  # compared with a box, a correct shape would score worse than a box
         return PairScore(truth.label, True, False, class_right, box_iou)
     surfaces = [truth.mesh, object_mesh(found)]
     a, b = (sample_surface(mesh, points, 2 * seed + i) for i, mesh in enumerate(surfaces))

@@ -15,7 +15,7 @@ from sceneprior.core.scene import Scene, Turned
 from sceneprior.interchange.box_lists import NOT_FURNITURE
 
 ENDS = ("start", "end")
-"""Columns that ATISS appends to those of the classes."""
+"""Columns that ATISS appends to the class columns."""
 
 
 def write_atiss(scenes: Sequence[Scene], folder: Path) -> None:
@@ -45,7 +45,8 @@ def write_atiss(scenes: Sequence[Scene], folder: Path) -> None:
 
 
 def floor_plan(floor: shapely.Geometry) -> dict[str, np.ndarray]:
-    """ATISS's arrays of a floor plan: triangles at y = 0 that face up, and the origin as centroid.
+    """Convert a floor polygon to ATISS's arrays: triangles at y = 0 that face up, and the origin as
+    centroid.
 
     >>> floor_plan(shapely.box(-1, -1, 1, 1))["floor_plan_faces"].shape
     (2, 3)

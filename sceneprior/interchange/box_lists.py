@@ -20,7 +20,7 @@ from sceneprior.render.topdown import box_mesh
 NEEDED = ("class_labels", "translations", "sizes", "angles")
 FLOOR = ("floor_plan_vertices", "floor_plan_faces", "floor_plan_centroid")
 NOT_FURNITURE = ("start", "empty", "void")
-"""Columns of class_labels without an object; the column `end` ends the list."""
+"""Columns of `class_labels` that stand for no object; the column `end` ends the list."""
 SIZES = {"half": 2.0, "full": 1.0}
 _QUARTER_RAD = 1e-4
 """Tolerance within which an angle counts as a quarter turn; such boxes need no mesh."""
@@ -67,8 +67,8 @@ def read_boxes(
     columns: Sequence[str] | None = None,
     size_factor: float = 2.0,
 ) -> list[Scene]:
-    """Read the rooms of one file; see `read_box_lists`. If there are several, a number is appended
-    to their name.
+    """Read the rooms of one file; see `read_box_lists`. If the file holds several rooms, a number
+    is appended to each room's name.
 
     Args:
         path: `.npz` with one room (arrays over objects) or several (one more leading axis), or
@@ -111,7 +111,8 @@ def _records(path: Path) -> list[dict[str, Any]]:
 
 
 def _one_by_one(path: Path, record: dict[str, Any]) -> list[dict[str, Any]]:
-    """Split a record into rooms with arrays over objects; a first axis may hold several rooms."""
+    """Split a record into rooms with arrays over objects; its arrays may have a leading axis over
+    rooms."""
     try:
         labels, *boxes = (np.asarray(record[key]) for key in NEEDED)
         centers, sizes, angles = (part.astype(np.float64, casting="same_kind") for part in boxes)
@@ -195,7 +196,7 @@ def _label_names(
 def turned_box(
     label: str, center: Float[np.ndarray, "3"], size: Float[np.ndarray, "3"], yaw_rad: float
 ) -> SceneObject:
-    """A `SceneObject` from a box turned about +y, +z towards +x.
+    """Build a `SceneObject` from a box rotated about +y by `yaw_rad`, which turns +z towards +x.
 
     The object has the axis-aligned box around the turned one, which is kept as `turned`. Unless the
     angle is a quarter turn, the object's mesh is the turned box, so that pictures show it.

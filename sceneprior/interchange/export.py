@@ -41,10 +41,10 @@ SIMULATORS: Mapping[str, Callable[[Sequence[Scene], Path, ShellName], None]] = {
     "usd": _write_usd,
     "habitat": write_habitat,
 }
-"""Formats of simulators; objects are made to stand before they are written (`core/standing.py`)."""
+"""Simulator formats; objects are made physically stable before export (`core/standing.py`)."""
 FORMATS = (*CLASS_FORMATS, *SIMULATORS, "sceneeval", "obj")
 GROWN_M = 0.01
-"""Smallest displacement of walls, in metres, that the notes mention."""
+"""Displacement of walls, in metres, from which a note mentions it."""
 
 
 def export_scenes(
@@ -88,7 +88,7 @@ def export_scenes(
 
 
 def stand_all(scenes: Sequence[Scene]) -> tuple[list[Scene], list[str]]:
-    """Scenes in which all objects stand, and a note on the changes, if there are any."""
+    """Make all objects of the scenes stand; also return a note on the changes, if any."""
     pairs = [stand(scene) for scene in scenes]
     changes = sum((counts for _, counts in pairs), Counter[str]())
     standing = [scene for scene, _ in pairs]
@@ -96,7 +96,9 @@ def stand_all(scenes: Sequence[Scene]) -> tuple[list[Scene], list[str]]:
     if not listed:
         return standing, []
     total = sum(len(scene.objects) for scene in scenes)
-    return standing, [f"So that nothing falls over or overlaps, of {total} objects: {listed}."]
+    return standing, [
+        f"Changed so that nothing falls over or overlaps: {listed} (of {total} objects)."
+    ]
 
 
 def _moved_walls(scenes: Sequence[Scene]) -> list[str]:

@@ -16,7 +16,7 @@ from sceneprior.interchange.box_lists import FLOOR, floor_outline
 from sceneprior.interchange.structured3d import KEYS, read_annotated_room
 
 FINEST_M = 0.02
-"""Tolerance of the simplification of floors made of triangles, so that walls are straight."""
+"""Tolerance in metres for simplifying floors made of triangles, so that walls are straight."""
 
 
 class FloorPlan(NamedTuple):

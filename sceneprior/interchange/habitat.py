@@ -1,4 +1,4 @@
-"""Export as a scene dataset of habitat-sim: JSON configs and GLBs; y up, metres."""
+"""Export as a habitat-sim scene dataset: JSON configs and GLBs; y up, metres."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -18,7 +18,7 @@ from sceneprior.render.topdown import node_names, scene_meshes
 
 DATASET_FILE = "rooms.scene_dataset_config.json"
 UP, FRONT = [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]
-"""Axes of an asset in habitat-sim. A `SceneObject` faces +z in its own frame."""
+"""Axes of a habitat-sim asset. (A `SceneObject` faces +z in its own frame.)"""
 
 
 def write_habitat(scenes: Sequence[Scene], folder: Path, shell: ShellName) -> None:
@@ -26,7 +26,7 @@ def write_habitat(scenes: Sequence[Scene], folder: Path, shell: ShellName) -> No
 
     A stage is the shell of a room. An object has a GLB for rendering, a GLB of its convex bodies
     for collisions, a mass and a class (`semantic_id` is the index of the class in the label set).
-    Objects that hang are static, the others dynamic. If the yaw of an object is known
+    Hanging objects are static, all others dynamic. If the yaw of an object is known
     (`SceneObject.turned`), its asset faces -z and the scene instance rotates it; other assets keep
     the axes of the room.
 

@@ -15,7 +15,7 @@ from sceneprior.render.scene_files import scene_to_glb
 from sceneprior.render.topdown import node_names, scene_meshes
 
 PREFIX = "sceneprior"
-"""Prefix of model ids, from which SceneEval knows the data set of a model."""
+"""Prefix of model ids, by which SceneEval identifies a model's data set."""
 Z_UP = {"up": [0, 0, 1], "front": [0, 1, 0]}
 
 
@@ -76,7 +76,7 @@ def _architecture(name: str, shell: Shell) -> dict[str, Any]:
     ]
     for row, wall in enumerate(shell.walls):
         length = wall.length_m
-        # With z up the outline runs the other way, so that each wall is written from its end.
+        # With z up, the outline has the opposite orientation, so each wall is written from its end.
         points = [[float(x), -float(z), 0.0] for x, z in (wall.end_m, wall.start_m)]
         holes = [
             {

@@ -23,15 +23,15 @@ from sceneprior.core.scene import Opening
 from sceneprior.core.scene_json import check_floor
 
 KEYS = ("junctions", "lines", "planes", "semantics", "planeLineMatrix", "lineJunctionMatrix")
-"""Keys by which such a file is recognized."""
+"""Keys by which an `annotation_3d.json` is recognized."""
 HOLES = ("door", "window")
 NOT_ROOMS = (*HOLES, "outwall")
-"""Types of semantics that are no rooms."""
+"""Types of entries in `semantics` that are not rooms."""
 AT_WALL_M = 0.03
-"""Maximum distance of the corners of a hole from the room's wall; walls are thicker than this, so
-the hole's other corners belong to the room on the other side."""
+"""Maximum distance in metres from a hole's corner to the room's wall. Walls are thicker, so the
+hole's corners beyond this distance belong to the room on the other side."""
 NARROWEST_M = 0.3
-"""Narrower openings are left out."""
+"""Minimum width of an opening in metres; narrower openings are left out."""
 GRID_M = 0.001
 
 
@@ -54,8 +54,8 @@ class _House(NamedTuple):
 def read_annotated_room(
     path: Path, data: dict[str, Any], name: str
 ) -> tuple[np.ndarray, tuple[Opening, ...], float | None]:
-    """Outline of the floor (x, z), openings and height of the ceiling of one room, in metres. x and
-    -z are the file's x and y, and the outline has a corner only where its walls turn.
+    """Floor outline (x, z), openings and ceiling height of one room, in metres. x and -z are the
+    file's x and y, and the outline has a corner only where its walls turn.
 
     Args:
         name: The `ID` of the room, or its type if only one room has it; may be empty if the house

@@ -120,7 +120,9 @@ def test_a_floor_in_its_place_replaces_that_of_the_scene(prior):
     assert all(each["holds"] for each in room.extra["wishes"])
     (room,) = prior.complete(scene, 1, ceiling_m=2.5)
     assert (room.floor_m == outline).all() and room.openings == (door,) and room.ceiling_m == 2.5
-    with pytest.raises(InputError, match="The classes to add are listed, and the request has want"):
+    with pytest.raises(
+        InputError, match="`classes` lists the classes to add, but the request also has want"
+    ):
         prior.complete(scene, 1, classes=["nightstand"], want="a nightstand")
 
 

@@ -47,7 +47,7 @@ def test_mujoco_gets_primitives_that_stand(tmp_path):
     table = SceneObject("table", (0.0, 0.55, 0.0), (1.0, 0.9, 1.0), solids=solids)
     lamp = SceneObject("pendant_lamp", (1.0, 2.2, -0.5), (0.3, 0.4, 0.2))
     (note,) = export_scenes([Scene("one", BEDROOM, (table, lamp))], "mujoco", tmp_path)
-    assert note.endswith("of 2 objects: 1 set down.")
+    assert note.endswith("overlaps: 1 set down (of 2 objects).")
     root = ElementTree.parse(tmp_path / "one.xml").getroot()
     first, second = root.findall(".//body")
     assert (first.get("name"), second.get("name")) == ("0_table", "1_pendant_lamp")
@@ -64,7 +64,7 @@ def test_mujoco_gets_primitives_that_stand(tmp_path):
 def test_mujoco_loads_a_room_with_walls_in_which_nothing_overlaps(scene, tmp_path):
     mujoco = pytest.importorskip("mujoco", reason="no mujoco here: pip install -e '.[sim]'")
     assert export_scenes([scene], "mujoco", tmp_path) == [
-        "So that nothing falls over or overlaps, of 3 objects: 1 set down.",
+        "Changed so that nothing falls over or overlaps: 1 set down (of 3 objects).",
         "Walls of 1 rooms stand further out than floor_m, by up to 0.30 m, because furniture "
         "stands there.",
     ]

@@ -33,7 +33,7 @@ SplitOption = Annotated[
     str, typer.Option(help="Rooms to compare with: test to report, val to choose settings.")
 ]
 BoxesOption = Annotated[
-    bool, typer.Option("--boxes", help="Compare layouts alone, too: all rooms as boxes.")
+    bool, typer.Option("--boxes", help="Also compare layouts only: all rooms drawn as boxes.")
 ]
 ResamplesOption = Annotated[
     int, typer.Option(min=0, help="Number of bootstrap resamples; 0 leaves intervals out.")
@@ -69,7 +69,7 @@ def eval_fid(
     FID and KID are computed only with --inception, the user's Inception network. Without it, the
     Frechet and kernel distances use EfficientNet-Lite0 features; they are not FID or KID, and their
     values cannot be compared with FID or KID. The protocol is written with the scores. `evaluate`
-    measures the use of the rooms, too.
+    also measures whether rooms can be used.
     """
     from sceneprior.apps.experiments.evaluate import evaluate_folder, evaluate_run
     from sceneprior.evaluation.synthesis import EvalOptions
@@ -105,18 +105,16 @@ def evaluate(
         Path | None,
         typer.Option(
             help="Shards with real rooms to compare with (default: those of the run, if they are "
-            "there); without shards the rooms are measured alone."
+            "there); without shards, nothing is compared."
         ),
     ] = None,
     only_use: Annotated[
         bool,
-        typer.Option("--only-use", help="Leave out what eval-fid measures; no picture is drawn."),
+        typer.Option("--only-use", help="Compute only metrics of use, not those of eval-fid."),
     ] = False,
     standing: Annotated[
         bool,
-        typer.Option(
-            "--stand", help="Measure the use of rooms as `export --to mujoco` writes them."
-        ),
+        typer.Option("--stand", help="First make objects stand, as `export --to mujoco` does."),
     ] = False,
     settle: Annotated[
         str,
@@ -140,9 +138,9 @@ def evaluate(
 ) -> None:
     """Measure whether rooms can be used, and compare them with real rooms, as eval-fid does.
 
-    Metrics of use need scenes alone: collisions, support, free floor, doors (SceneEval, PhyScene,
-    ReSpace), and stability in MuJoCo. With shards, real, shuffled and random rooms stand beside,
-    and all metrics of eval-fid are computed; without, only the metrics of use.
+    Metrics of use need only scenes: collisions, support, free floor, doors (SceneEval, PhyScene,
+    ReSpace), and stability in MuJoCo. With shards, real, shuffled and random rooms are measured for
+    comparison, and all metrics of eval-fid are computed; without shards, only the metrics of use.
     """
     from sceneprior.apps.experiments.evaluate import evaluate_folder, evaluate_run
     from sceneprior.evaluation.synthesis import EvalOptions

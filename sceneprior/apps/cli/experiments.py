@@ -16,7 +16,7 @@ def _stopped_by_ctrl_c() -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        typer.echo("Stopped. The same command goes on from here.", err=True)
+        typer.echo("Stopped. Run the same command again to continue.", err=True)
         raise typer.Exit(130) from None
 
 
@@ -46,8 +46,8 @@ def compare(
         typer.echo(f"Wrote {done.table}")
     if done.left_out:
         typer.echo(
-            "Not in the table, since trained or evaluated otherwise (settings, rooms, seed, "
-            f"weights): {'; '.join(done.left_out)}. Name them in the options to "
+            "Not in the table, because trained or evaluated with other settings, rooms, seeds or "
+            f"weights: {'; '.join(done.left_out)}. Name them in the options to "
             "evaluate them again.",
             err=True,
         )

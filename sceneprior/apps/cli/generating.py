@@ -1,6 +1,7 @@
 """Commands that generate or complete rooms, or retrieve models; dependencies load when called.
 
-Pictures are drawn by the z-buffer: without a GPU, GL takes a second to start and is slower.
+Pictures are rendered by the z-buffer, because without a GPU, GL is slower and takes a second to
+start.
 """
 
 from pathlib import Path
@@ -30,7 +31,7 @@ from sceneprior.apps.cli.options import (
 )
 
 BROKEN_TOLD = 5
-"""Largest number of broken models of which `retrieve` prints the reasons."""
+"""Maximum number of broken models whose reasons `retrieve` prints."""
 
 
 def synthesize(
@@ -46,7 +47,7 @@ def synthesize(
     request: RequestOption = None,
     cad: CadOption = False,
     html: Annotated[
-        bool, typer.Option("--html", help="Write rooms.html, too: one page of 3D models.")
+        bool, typer.Option("--html", help="Also write rooms.html, one page of 3D models.")
     ] = False,
     shell: ShellOption = None,
     overwrite: OverwriteOption = False,
@@ -122,8 +123,8 @@ def complete(
 ) -> None:
     """Complete a room, given some objects and optionally the floor.
 
-    A requested floor, door, window or ceiling replaces that of the scene; objects of a request are
-    added to the scene's. Without --shell, GLBs hold furniture only.
+    A requested floor, door, window or ceiling replaces the scene's; requested objects are added to
+    the scene's. Without --shell, GLBs hold furniture only.
     """
     from dataclasses import replace
 

@@ -95,7 +95,7 @@ def request_of(
     want: str | None,
     request: Path | None,
 ) -> dict[str, Any]:
-    """Arguments of `Prior.sample` from the options of a request and its file."""
+    """Build the arguments of `Prior.sample` from the options of a request and its file."""
     from sceneprior.apps.requests import load_request, merged
 
     asked = {"floor": floor, "openings": openings, "ceiling_m": ceiling, "want": want}
@@ -103,11 +103,11 @@ def request_of(
 
 
 def note_unmet(scenes: Sequence["Scene"]) -> None:
-    """Tell which wishes do not hold, by room."""
+    """Print the wishes that each room does not fulfil."""
     for room in scenes:
         unmet = [each["wish"] for each in room.extra.get("wishes", []) if not each["holds"]]
         if unmet:
-            typer.echo(f"Note: in {room.name} these do not hold: {', '.join(unmet)}.", err=True)
+            typer.echo(f"Note: {room.name} does not fulfil: {', '.join(unmet)}.", err=True)
 
 
 def result_file(run: str, out: Path | None, name: str) -> Path:
@@ -118,7 +118,9 @@ def result_file(run: str, out: Path | None, name: str) -> Path:
         return checked_target(out)
     folder = find_prior(run)
     if folder != Path(run) or not folder.is_dir():
-        raise InputError(f"{run} is not a folder that {name} could go to; name a file with --out.")
+        raise InputError(
+            f"{run} is not a folder, so {name} cannot go there; name a file with --out."
+        )
     return checked_target(folder / name)
 
 
@@ -133,7 +135,7 @@ def checked_shell(shell: str) -> "ShellName":
 
 
 def checked_target(target: Path) -> Path:
-    """Check, before the work begins, that a file can be written; returns it."""
+    """Check, before the work begins, that a file can be written; return its path."""
     from sceneprior.core.files import check_writable
 
     if target.is_dir():

@@ -28,9 +28,9 @@ def reconstruct(
     out: Annotated[Path, typer.Option(help="Folder for the rooms.")],
     shards: Annotated[Path | None, typer.Option(help="Shards with the images.")] = None,
     room: Annotated[str | None, typer.Option(help="Id of a room of the shards.")] = None,
-    view: Annotated[int, typer.Option(min=0, help="Number of the room's view.")] = 0,
+    view: Annotated[int, typer.Option(min=0, help="Index of the room's view, from 0.")] = 0,
     split: Annotated[
-        str | None, typer.Option(help="One view of each room of this split: train or test.")
+        str | None, typer.Option(help="Split of which to use one view per room: train or test.")
     ] = None,
     limit: LimitOption = None,
     mask: Annotated[
@@ -45,7 +45,9 @@ def reconstruct(
     pose: Annotated[Path | None, typer.Option(help="JSON of your camera's pose.")] = None,
     camera_height: Annotated[
         float | None,
-        typer.Option(min=0.1, help="Height of your camera in m, without --pose (tries several)."),
+        typer.Option(
+            min=0.1, help="Height of your camera in m, without --pose (default: tries several)."
+        ),
     ] = None,
     gravity: Annotated[
         str | None,
@@ -84,7 +86,7 @@ def reconstruct(
     if shards is None:
         if mask is None or intrinsics is None:
             raise InputError("--mask needs --intrinsics and, for a PNG, --classes.")
-        # A fit object by object does not depend on the side of the room that the camera is at.
+        # Object-by-object fits do not depend on the side of the room at which the camera stands.
         sides = 1 if fit == OBJECTS else QUARTERS
         own = read_own_image(
             mask, classes, intrinsics, prior.label_set, pose, camera_height, sides, gravity
@@ -116,7 +118,7 @@ def reconstruct(
 
 def eval_svr(
     shards: Annotated[Path, typer.Option(help="Shards with 3D ground truth.")],
-    run: Annotated[str | None, typer.Option(help="Run whose fits to evaluate.")] = None,
+    run: Annotated[str | None, typer.Option(help="Run to evaluate.")] = None,
     scenes: Annotated[
         Path | None, typer.Option(help="Scenes of `reconstruct` or `retrieve`, in place of --run.")
     ] = None,
@@ -130,7 +132,7 @@ def eval_svr(
     restarts: RestartsOption = 1,
     models: Annotated[
         Path | None,
-        typer.Option(help=f"CAD models to evaluate the fits with, too: {MODELS_HELP}"),
+        typer.Option(help=f"CAD models to put in place of the fits, too: {MODELS_HELP}"),
     ] = None,
     seed: SeedOption = 0,
 ) -> None:

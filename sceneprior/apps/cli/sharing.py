@@ -123,7 +123,8 @@ def export(
 ) -> None:
     """Export scenes to another format, or convert box lists, such as ATISS's, to scenes.
 
-    Simulators get walls unless --shell says otherwise, and objects that stand and lie apart.
+    For simulators, walls are added unless --shell says otherwise, and objects are moved until they
+    stand and do not overlap.
     """
     from sceneprior.apps.rooms import check_free, write_scenes
     from sceneprior.interchange.box_lists import read_box_lists

@@ -43,8 +43,8 @@ def view(
 ) -> None:
     """View rooms in the browser, request new ones, and explore the latent space of a run.
 
-    Ctrl-C ends it. The page begins with the request of the options, and with walls unless --shell
-    says otherwise.
+    Ctrl-C ends it. The first room fulfils the request given by the options, and is shown with walls
+    unless --shell says otherwise.
     """
     from sceneprior.apps.viewer.server import check_can_serve, serving
     from sceneprior.core.errors import InputError

@@ -131,14 +131,14 @@ def steps_of(
     folder = run.folder / "run"
     settings = [word for setting in run.settings for word in ("--set", setting)]
     last = run.run_config.stage_names[-1]
-    # One device: several would share each batch, or train on larger ones.
+    # One device, because several would split each batch, or train on larger batches.
     device = ["--accelerator", options.accelerator, "--devices", "1"]
     words = ["fit", "--config", run.config, "--run", str(folder), *settings, "--logger", "csv"]
     fit = Step(
         "fit",
         [*words, *device, "--resume"],
         result=folder / last / "final.ckpt",
-        depends_on=[],  # other settings do not repeat `fit`: `keeps_settings` refuses the run
+        depends_on=[],  # changed settings never repeat `fit`: `keeps_settings` refuses the run
         continues=folder / "config.yaml",
     )
     return [fit, *scoring]

@@ -205,7 +205,8 @@ def load_comparison(name: str) -> Comparison:
 def part_of(
     comparison: Comparison, methods: str | None, rooms: str | None, seeds: str | None
 ) -> Comparison:
-    """A comparison of some methods, kinds of rooms and seeds, each given as `a,b`; None is all."""
+    """The part of a comparison with the given methods, kinds of rooms and seeds, each as `a,b`;
+    None means all."""
     by_seed = {str(seed): seed for seed in comparison.seeds}
     return comparison.model_copy(
         update={
@@ -229,8 +230,8 @@ def _chosen(what: str, given: str | None, known: dict[str, _T]) -> dict[str, _T]
 
 
 def runs_of(comparison: Comparison, out: Path) -> list[Run]:
-    """Every run: scenes first, then seed by seed, so that a comparison that is stopped early is
-    complete for fewer seeds.
+    """All runs: scenes first, then seed by seed, so that a comparison stopped early is complete for
+    fewer seeds.
     """
     runs = []
     for seed in (None, *comparison.seeds):
@@ -250,7 +251,7 @@ def runs_of(comparison: Comparison, out: Path) -> list[Run]:
 
 
 def _taken_over(rooms: Rooms, method: Method) -> list[str]:
-    """Settings that a method with its own config shares with the others on the same rooms."""
+    """Settings that a method with its own config takes from the config of the rooms."""
     if method.config is None:
         return []
     shared, own = read_settings(rooms.config)[1], read_settings(method.config)[1]
@@ -258,7 +259,7 @@ def _taken_over(rooms: Rooms, method: Method) -> list[str]:
     if _value(own, "model.max_objects") is not None:
         keys.append("model.max_objects")
     values = {key: _value(shared, key) for key in keys}
-    # Quoted as JSON, which is valid YAML, so that a folder called 2024 stays a string.
+    # Values are quoted as JSON, which is valid YAML, so that a folder called 2024 stays a string.
     return [f"{key}={json.dumps(v)}" for key, v in values.items() if v is not None]
 
 

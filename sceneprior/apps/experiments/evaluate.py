@@ -55,8 +55,8 @@ def evaluate_run(
     The options' seed also draws the latents; `shards` and `distribution` default to the run's.
 
     Args:
-        use: Measure the use of the rooms, too; if there are no shards, only this.
-        asked: Request that the rooms fulfil, as of `Prior.sample`; with `use` only.
+        use: Also compute metrics of use; without shards, compute only these. asked: Request for the
+        rooms, as arguments of `Prior.sample`; only with `use`.
     """
     trained = load_any_run(run)
     folder = shards or Path(trained.config.data.shards)
@@ -112,7 +112,7 @@ def evaluate_folder(
     use: UseOptions | None = None,
 ) -> dict[str, Any]:
     """Score `count` of the user's scenes (None: all), of any method, against test rooms, and write
-    the scores; `use` measures their use, too, and does not need `shards`."""
+    the scores; with `use`, metrics of use are added and `shards` are optional."""
     scenes = load_scene_folder(folder)
     if count is not None and count > len(scenes):
         raise InputError(

@@ -34,7 +34,7 @@ from sceneprior.paper.trained import TrainedPrior
 from sceneprior.render.silhouettes.render import render_scene
 
 VIEWS = 4
-"""Views of each training room in which its decoded masks are compared."""
+"""Number of views per training room in which decoded masks are compared."""
 _BATCH = 8
 _NOTE = (
     "The rooms of these shards are known from views alone: objects are counted as they appear in "
@@ -53,8 +53,8 @@ def evaluate_from_views(
 ) -> dict[str, Any]:
     """Compute the metrics that need no 3D ground truth, in the format of `evaluate_synthesis`.
 
-    The result holds the scores of the generated rooms by key of `METRICS`, those of real training
-    rooms under `train_rooms`, and those of the rooms compared with under `<key>_test`.
+    The result holds the generated rooms' scores by key of `METRICS`, the real training rooms'
+    scores under `train_rooms`, and the test rooms' scores under `<key>_test`.
     """
     names = common_label_set(generated)
     rooms = {split: _counted(shards, split, names) for split in ("train", options.split)}
@@ -162,7 +162,7 @@ def mask_iou_of_rooms(trained: TrainedPrior, views: SceneViews) -> float:
 
 
 def _counted(shards: Path, split: str, names: str) -> Int[np.ndarray, "rooms classes"]:
-    """Tracked objects of each class in each room, void left out."""
+    """Number of tracked objects of each class in each room, void left out."""
     tables = []
     for shard, room_id in iterate_rooms(shards, split):
         if shard.label_set != names:

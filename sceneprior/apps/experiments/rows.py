@@ -28,8 +28,8 @@ GROUPS = {
     DECODED: "training rooms, decoded: nothing is new",
     "kernel": "copies: rooms near training rooms",
 }
-"""Headings of the groups of a table of new rooms, in order, by the origin of the rooms. `{}` stands
-for the method's supervision."""
+"""Group headings of a table of new rooms, in order, by the origin of the rooms. `{}` stands for the
+method's supervision."""
 SHAPES = {"fit": "as found", "fit_cad": "CAD models"}
 """Rows of an `eval-svr` result that the table shows, with their values in the column `shapes`."""
 

@@ -55,7 +55,7 @@ class StepRunner:
         if not self._calling:
             raise KeyboardInterrupt
         if self._process is not None:
-            # Not `Popen.send_signal`, which would collect the exit status that wait4 waits for.
+            # `Popen.send_signal` would collect the exit status that wait4 waits for.
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self._process.pid, signal.SIGINT)
 
@@ -81,7 +81,8 @@ class StepRunner:
             took = {cost: noted.get(step.name, {}).get(cost) for cost in _COSTS}
         earlier = dict(takewhile(lambda item: item[0] != step.name, noted.items()))
         entry: dict[str, Any] = {"arguments": step.arguments, "depends_on": step.depends_on}
-        # Recorded without costs until the command ends: the costs of a killed command are unknown.
+        # The step is recorded without costs until it ends: the costs of a killed command are
+        # unknown.
         write_json(folder / "steps.json", {**earlier, step.name: entry})
         status, costs = self.call([*step.arguments, *unshown], log)
         for cost, combine in _COSTS.items():
@@ -105,7 +106,7 @@ class StepRunner:
                 )  # fmt: skip
                 if self.stopped:  # a signal came while the process started
                     self.stop()
-                # wait4 returns the usage of this child alone, including that of its own children.
+                # wait4 returns the usage of this child and its descendants only.
                 _, status, used = os.wait4(process.pid, 0)
                 process.returncode = os.waitstatus_to_exitcode(status)
             finally:
@@ -173,5 +174,5 @@ def failure_reason(log: Path | None, status: int) -> str:
     errors = [line.removeprefix("Error: ") for line in lines if line.startswith("Error: ")]
     told = errors or [line for line in lines if line]
     if status < 0 and not errors:
-        return f"killed by {signal.Signals(-status).name}; the same command goes on"
+        return f"killed by {signal.Signals(-status).name}; run the same command again to continue"
     return told[-1] if told else f"it printed nothing to {log}"

@@ -55,7 +55,7 @@ class Form:
     variant: str
     """Heading of the second column."""
     say: Callable[[dict[str, Any]], str]
-    """Function from one of the results to a sentence of the caption on the evaluation."""
+    """Builds the caption's sentence on the evaluation from one of the results."""
 
 
 def write_tables(rows: Sequence[Row], out: Path, form: Form) -> None:
@@ -189,7 +189,9 @@ def _of_views(scores: dict[str, Any]) -> str:
         "boxes are upright and along the room's axes, in the truth and in every answer",
     ]
     if known is not None:
-        told.insert(1, f"{known:.0%} of the objects have a CAD model that training rooms hold, too")
+        told.insert(
+            1, f"{known:.0%} of the objects have a CAD model that also occurs in training rooms"
+        )
     return "; ".join(told)
 
 

@@ -20,7 +20,7 @@ UNSTATED = (
     "them out before you redistribute it."
 )
 SHOWN = ("generated", "real training", "independent")
-"""Columns of the table of scores, besides the column of the test rooms."""
+"""Columns of the score table, besides the column of the test rooms."""
 
 
 def model_card(
@@ -31,7 +31,8 @@ def model_card(
     latents: bool = False,
     half: bool = False,
 ) -> str:
-    """The card as Markdown, from the user's text `about` the data and the scores of `eval-fid`."""
+    """The card as Markdown. `about` is the user's text on the data, `scores` a result of
+    `eval-fid`."""
     config = trained.config
     packed = trained
     if isinstance(trained, TrainedPrior) and not latents:

@@ -1,6 +1,6 @@
 """The file of a packed prior: weights, settings and a card, without executable code.
 
-It is a zip, which any tool opens and which compresses zeros well, of three files:
+The file is a zip, which any tool opens and which compresses zeros well, with three entries:
 
 README.md            the card (apps/priors/card.py)
 config.json          the run's settings, the stage, the classes; `PackedPrior`
@@ -98,7 +98,7 @@ def pack(trained: Trained, card: str, latents: bool = False, half: bool = False)
 
 
 def shared_settings(config: RunConfig) -> dict[str, Any]:
-    """A run's settings with the name of its data alone, not the path on the user's machine."""
+    """A run's settings, with the shards' path reduced to a name, to hide the user's folders."""
     settings = config.model_dump(mode="json", by_alias=True)
     settings["data"]["shards"] = Path(settings["data"]["shards"]).name
     return settings
@@ -114,7 +114,7 @@ def unpack(packed: PackedPrior, config: RunConfig, source: str) -> Trained:
         if packed.said.stage not in config.stage_names:
             raise ValueError(f"no stage of its method is called '{packed.said.stage}'")
         build = partial(config.networks, packed.said.stage, len(packed.said.room_ids))
-        # First on the meta device: settings may describe networks too large for any memory.
+        # Build on the meta device first: settings may describe networks too large for memory.
         with torch.device("meta"), _ShapesAlone():
             shapes = {name: tensor.shape for name, tensor in build().state_dict().items()}
         found = {name: tensor.shape for name, tensor in packed.tensors.items()}
@@ -141,7 +141,7 @@ def unpack(packed: PackedPrior, config: RunConfig, source: str) -> Trained:
 
 
 class _ShapesAlone(TorchFunctionMode):
-    """Skips functions on the device `meta` that only set values.
+    """Skips functions on the meta device that only set values.
 
     Torch would import its compiler for them, which takes as long as the rest of loading a prior.
     """
@@ -163,11 +163,11 @@ def _check(name: str, tensor: Tensor, classes: int) -> None:
         if not tensor.isfinite().all():
             raise ValueError(f"{name} holds numbers that are not finite")
     elif name.endswith("_class") and not ((tensor >= -1) & (tensor < classes)).all():
-        raise ValueError(f"{name} names classes that are not there")
+        raise ValueError(f"{name} holds class indices out of range")
     elif name.endswith("part_kind") and not ((tensor >= -1) & (tensor < KINDS)).all():
-        raise ValueError(f"{name} names kinds of parts that are not there")
+        raise ValueError(f"{name} holds part types out of range")
     elif name.endswith(("backs", "fronts")) and not ((tensor >= 0) & (tensor < QUARTERS)).all():
-        raise ValueError(f"{name} names sides that are not there")
+        raise ValueError(f"{name} holds side indices out of range")
 
 
 def write_packed(packed: PackedPrior, path: Path) -> None:

@@ -36,7 +36,7 @@ def find_prior(where: str | Path) -> Path:
 
 
 def name_of(where: str | Path) -> str:
-    """The name of a prior for the files that it makes, without the folders of the machine.
+    """The name of a prior as stored in generated files, without the folders of this machine.
 
     >>> name_of("runs/bedroom.prior"), name_of("hf://owner/rooms"), name_of("out/demo/run")
     ('bedroom', 'hf://owner/rooms', 'run')

@@ -72,16 +72,16 @@ def read_own_image(
 ) -> OwnImage:
     """Read an image's masks and camera.
 
-    Classes outside the run's label set become those of `SAME_CLASS`, or void.
+    Classes outside the run's label set are replaced by `SAME_CLASS`, or else by void.
 
     Args:
-        mask: A PNG of ids, or COCO's JSON, which has the classes too.
-        pose: File for `read_pose`. None assumes a camera at one of `sides` of the room, at the
+        mask: A PNG of ids, or COCO's JSON, which also has the classes. pose: File for `read_pose`.
+        None assumes a camera at one of `sides` of the room, at the
             given height or at all `CAMERA_HEIGHTS_M`, tilted by `gravity`; None is level.
     """
     if mask.suffix.lower() == ".json":
         if classes is not None:
-            raise InputError(f"{mask} has its classes in itself; leave out --classes {classes}.")
+            raise InputError(f"{mask} already lists its classes; leave out --classes {classes}.")
         values, of_id = read_coco(mask)
         classes = mask
     elif classes is None:
@@ -143,7 +143,7 @@ def read_own_image(
 def _known_by_another_name(
     of_id: dict[int, str], label_set_name: str
 ) -> tuple[dict[int, str], list[str]]:
-    """Rename classes by `SAME_CLASS` to those of the label set; notes list the renamed classes."""
+    """Rename classes to those of the label set by `SAME_CLASS`; also return notes on these."""
     known = {tidy(name) for name in label_set(label_set_name)}
     taken: Counter[tuple[str, str]] = Counter()
     for key, name in of_id.items():
@@ -162,7 +162,7 @@ def _some(values: Sequence[int] | np.ndarray) -> str:
 
 
 def level_camera(height_m: float, quarter: int = 0) -> np.ndarray:
-    """`world_to_camera` of a level camera `height_m` above the floor that faces the room's middle.
+    """`world_to_camera` of a level camera at height `height_m`, facing the middle of the room.
 
     The horizontal distance to the middle is `CAMERA_DISTANCE_M`. With `quarter` 0 the camera is on
     the +z side and looks along -z; each quarter turns it about +y.
@@ -197,7 +197,7 @@ def read_gravity(text: str) -> np.ndarray:
 
 
 def tilted(down: np.ndarray) -> np.ndarray:
-    """(4, 4) transform that tilts a level camera: the smallest rotation of +y to `down`.
+    """(4, 4) transform that tilts a level camera: the smallest rotation from +y to `down`.
 
     `down` is the unit vector of gravity in camera axes. The transform is applied after the level
     camera's `world_to_camera`.

@@ -24,7 +24,7 @@ from sceneprior.training.method import Trained, TrainedReconstructor
 BATCH = 128
 """Number of latents fitted at once: images times restarts."""
 OBJECTS = "objects"
-"""Name of the fit object by object (method `lifted`); any other name is a schedule of latents."""
+"""Name of the object-by-object fit (method `lifted`); other names are schedules of latent fits."""
 START_BATCH = 256
 """Number of training rooms decoded at once."""
 
@@ -39,8 +39,8 @@ class FitOptions:
     """Number of latents fitted to each image, started at the nearest training rooms; the latent
     with the lowest score is kept."""
     masks: bool = True
-    """Fit latents to masks, too. False uses classes and 2D boxes only, as is always done if shapes
-    are looks rather than meshes."""
+    """Also fit latents to masks. False uses only classes and 2D boxes, as is always done if shapes
+    are posed prototypes rather than meshes."""
 
 
 @dataclass(frozen=True)

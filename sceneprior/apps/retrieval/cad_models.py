@@ -33,7 +33,7 @@ _MESHES_KEPT = 256
 _TEXTURED_KEPT = 32
 
 Track = Callable[[list[str]], Iterable[str]]
-"""Wraps an iteration over model ids, for a progress bar."""
+"""Wraps an iterable of model ids, for a progress bar."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def _points_of_models(
 ) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Sample `count` points of each model; returns them, and the reasons for broken models.
 
-    The points are cached in an npz in the folder `cache`, also when interrupted.
+    The points are cached in an npz in the folder `cache`, even if sampling is interrupted.
     """
     settings = f"{folder.resolve()}|{count}|{SEED}|{FORMAT}"
     kept = cache / f"points-{hashlib.sha256(settings.encode()).hexdigest()[:16]}.npz"
@@ -145,7 +145,7 @@ def _points_of_models(
             try:
                 mesh = found.read(found.paths[model_id])
                 vertices = np.asarray(mesh.vertices_m, dtype=np.float64)
-                # Sampled before scaling to the unit box, which would enlarge thin sides.
+                # Points are sampled before scaling to the unit box, which would enlarge thin sides.
                 drawn = surface_points(vertices, mesh.faces, count, SEED)
                 points[model_id] = unit_points(drawn, vertices).astype(np.float32)
                 stamps[model_id] = todo[model_id]

@@ -1,6 +1,6 @@
-"""The furniture that the package makes itself (`sceneprior/furniture`), as CAD models by class.
+"""The package's own procedural furniture (`sceneprior/furniture`), as CAD models by class.
 
-Nothing is stored: a class is built from its tables when an object first needs it, in 10 to 100 ms.
+Nothing is stored: a class is built when an object first needs it, in 10 to 100 ms.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,7 +19,8 @@ def with_models(scenes: Sequence[Scene], given: Sequence[SceneObject] = ()) -> l
     """Scenes with the package's own models in place of their meshes (`retrieve`).
 
     Args:
-        given: The first objects of every scene, as a user gave them: those with a mesh keep it.
+        given: Objects given by the user, which come first in every scene;
+            those with a mesh keep it.
     """
     keep = [row for row, item in enumerate(given) if item.mesh is not None]
     return list(retrieve_all(scenes, made_models(), keep))

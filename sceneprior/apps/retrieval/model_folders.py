@@ -107,7 +107,7 @@ def _own_files(folder: Path) -> list[Path]:
 
 
 def _own_models(folder: Path, label_set_name: str) -> ModelFiles:
-    """Models in sub-folders by class; a folder whose name is no class at all is a warning."""
+    """Models in sub-folders by class; a folder with an unknown class name gives a warning."""
     labels, paths = {}, {}
     for home in _own_folders(folder):
         files = _own_files(home)
@@ -130,10 +130,10 @@ def _own_models(folder: Path, label_set_name: str) -> ModelFiles:
 
 
 def class_of_folder(name: str, label_set_name: str) -> str | None:
-    """The class of models in a folder of this name: a class of the label set, or a category of
-    3D-FUTURE, in any case, with spaces or underscores.
+    """Class of the models in a folder, from the folder's name, which is a class of the label set or
+    a 3D-FUTURE category. Upper case and underscores for spaces are allowed.
 
-    `void` for a class or a category that the label set lacks; None for any other name.
+    `void` for a known class or category that the label set lacks; None for an unknown name.
 
         >>> class_of_folder("Double_Bed", "front3d_bedroom"), class_of_folder("king-size bed",
         ...     "front3d_bedroom")

@@ -34,12 +34,13 @@ candidates; None keeps `KEEP`."""
 KEEP = 16
 """Candidates (model and turn) compared by all points; None compares all: exact, and slow."""
 OTHER_TURN = 1.2
-"""Factor on the distance of models that are not turned as the object, if its yaw is known. The
-distance of a cupboard from behind is 1.0 to 1.1 times that from the front, of a chair 1.5 times."""
+"""Factor on the distances of models whose turn differs from the object's known yaw. Without the
+factor, a cupboard facing backwards has only 1.0 to 1.1 times the distance of one facing forwards; a
+chair has 1.5 times."""
 SURE = 0.5
-"""Least confidence at which a yaw counts as known."""
+"""Minimum confidence at which a yaw counts as known."""
 _BLOCK = 2**16
-"""Squared distances computed at a time, as many as fit in a core's cache."""
+"""Number of squared distances computed at a time, to fit in a core's cache."""
 
 
 class Retrieved(NamedTuple):
@@ -49,16 +50,16 @@ class Retrieved(NamedTuple):
     turn_deg: int
     """The yaw of the model in the room: 0, 90, 180 or 270 (docs/conventions.md)."""
     distance_m: float
-    """Chamfer distance of `chamfer_mean`."""
+    """Chamfer distance between the object and the model in metres, by `chamfer_mean`."""
 
 
 def retrieve(scene: Scene, models: CadModels, keep: Collection[int] = ()) -> Scene:
-    """The scene with the mesh and the materials of the most similar CAD model in every box.
+    """Replace every object's mesh and materials by those of the most similar CAD model.
 
-    Objects have the turn of their model as their yaw (`SceneObject.turned`). `extra["retrieval"]`
-    holds {"model_id", "turn_deg", "distance_m"} for each object, in the order of the objects. The
-    entry is None for a class without models; such an object keeps its mesh, extruded together with
-    its box.
+    The model's turn becomes the object's yaw (`SceneObject.turned`). `extra["retrieval"]` holds
+    {"model_id", "turn_deg", "distance_m"} for each object, in the order of the objects. The entry
+    is None for a class without models; such an object keeps its mesh, extruded together with its
+    box.
 
     Args:
         keep: Indices of objects that stay as they are; their entries are None.
@@ -143,8 +144,8 @@ def placed(unit: Mesh, item: SceneObject, turn_deg: int) -> Mesh:
 def most_similar(item: SceneObject, models: ClassModels, keep: int | None = KEEP) -> Retrieved:
     """The model and turn of a class that are nearest to an object by Chamfer distance.
 
-    If the yaw of the object is known to be a quarter turn, distances of models at other turns count
-    `OTHER_TURN` times.
+    If the object's yaw is known and a quarter turn, the distances of models at other turns are
+    multiplied by `OTHER_TURN`.
     """
     count = models.points.shape[1]
     views = _turned_views(_points_of(item, count) - np.asarray(item.center_m), item.size_m)
@@ -169,7 +170,7 @@ def most_similar(item: SceneObject, models: ClassModels, keep: int | None = KEEP
 
 
 def _known_turn(item: SceneObject) -> int | None:
-    """Quarters by which an object's yaw turns it; None if it is not known, or between two."""
+    """An object's yaw in quarter turns; None if the yaw is unknown or no quarter turn."""
     if item.turned is None or item.turned.confidence < SURE:
         return None
     quarters = item.turned.yaw_rad / (np.pi / 2)
@@ -204,7 +205,7 @@ def _rough_distances(
     choices: Int[np.ndarray, " choices"],
     step: int,
 ) -> Float[np.ndarray, " choices"]:
-    """`chamfer_mean` by every `step`-th point, for preselection."""
+    """`chamfer_mean` over every `step`-th point, for preselection."""
     rough = np.empty(len(choices), dtype=np.float32)
     few = models[:, ::step]
     for turn, (points, size) in enumerate(views):

@@ -25,10 +25,9 @@ class RequestFields:
     """Text fields of a request, and the drawing that fills two of them.
 
     Args:
-        asked: The request that the fields begin with, as arguments of `Prior.sample`; parts that
-            are no text stay part of every request until Clear.
-        safely: Runs a task of a browser, and shows its error.
-        drawn: Called with the plan when a drawing begins, and with None when it ends.
+        asked: The initial request, as arguments of `Prior.sample`; parts without a text field stay
+        part of every request until Clear. safely: Runs a browser's task, and shows errors. drawn:
+        Called with the plan when a drawing begins, and with None when it ends.
     """
 
     def __init__(
@@ -59,14 +58,14 @@ class RequestFields:
         self._say_rest()
 
     def asked(self) -> dict[str, Any]:
-        """The request as arguments of `Prior.sample`; no text of it names a file of this machine.
+        """The request as arguments of `Prior.sample`; texts that name files are refused.
 
         Raises:
             InputError: a field cannot be read.
         """
         asked = dict(self._rest)
         if floor := self.floor.value.strip():
-            read_floor(floor)  # text that is not a floor itself would name a file
+            read_floor(floor)  # raises if the text is not a floor, as it might then name a file
             asked["floor"] = floor
         if openings := self.openings.value.strip().strip(","):
             read_openings(openings)
@@ -83,7 +82,7 @@ class RequestFields:
         return asked
 
     def end_drawing(self) -> None:
-        """Leave the drawing; the floor's middle becomes the origin, as in the rooms."""
+        """End the drawing; the floor's middle becomes the origin, as in requested rooms."""
         if (plan := self.drawing.plan) is not None:
             self.drawing.show(None)
             self._filled(plan.centred())
@@ -109,15 +108,15 @@ class RequestFields:
 
     def _filled(self, plan: Plan) -> None:
         """Write a plan's texts into the fields."""
-        self._filling = True  # a field's update comes at once, before the other is written
+        self._filling = True  # setting a field fires its event before the other field is set
         self.floor.value, self.openings.value = plan.floor_text(), plan.openings_text()
         self._filling = False
 
     def _typed(self) -> None:
-        """Redraw the plan from the fields, unless it was the drawing that filled them."""
+        """Redraw the plan from the fields, unless the drawing itself filled them."""
         if self.drawing.plan is None or self._filling:
             return
-        # Text that is half-typed is no plan; a request with it says what is wrong.
+        # Half-typed text may not be a plan; a request reports the error later.
         with contextlib.suppress(InputError):
             self.drawing.show(plan_of(self.floor.value, self.openings.value))
 
@@ -131,14 +130,14 @@ class RequestFields:
         self._drawn(None)
 
     def _say_rest(self) -> None:
-        """Name the parts of the first request that are no text."""
+        """Show the names of request parts without a text field."""
         self._rest_said.visible = bool(self._rest)
         names = ", ".join(key.removesuffix("_m") for key in self._rest)
-        self._rest_said.content = html(f"The request of the command has more: {names}.")
+        self._rest_said.content = html(f"The command also requests: {names}.")
 
 
 def _texts_of(asked: Mapping[str, Any]) -> tuple[dict[str, str], dict[str, Any]]:
-    """The parts of a request as texts of the fields, and the parts that are no text."""
+    """Split a request into texts for the fields, and parts without a field."""
     texts = dict.fromkeys(("floor", "openings", "want", "ceiling_m"), "")
     rest: dict[str, Any] = {}
     for key, value in asked.items():

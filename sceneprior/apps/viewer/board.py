@@ -1,4 +1,4 @@
-"""The map of the latent space as a board in the scene, for clicks and drags."""
+"""The map of the latent space as a board in the 3D scene, for clicks and drags."""
 
 import math
 from collections.abc import Callable

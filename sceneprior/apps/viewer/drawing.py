@@ -19,7 +19,7 @@ HINT = (
     "it along the walls; click it to remove it."
 )
 GROUND_M = 60.0
-"""Side of the square round the plan that takes clicks."""
+"""Side of the square around the plan that receives clicks."""
 _GROUND, _CORNER, _MIDDLE = (250, 249, 246), (60, 70, 90), (160, 172, 196)
 _LOW_M, _HIGH_M = 0.02, 0.06
 """Heights above the floor of lines and of handles."""
@@ -148,12 +148,12 @@ class Drawing:
         return plan.with_opening(self.kind, at)
 
     def _drag_corner(self, kind: str, row: int, at: Point, ends: bool) -> None:
-        """Move a corner, or a new one from the middle of a side."""
+        """Move a corner, or create one by dragging the middle of a side."""
         assert self.plan is not None, "a plan is shown"
         if self._dragged is None:
             if kind == "middle":
                 grown = self.plan.with_corner(row, at)
-                if grown is not self.plan:  # else the new outline intersects itself
+                if grown is not self.plan:  # otherwise the new outline intersects itself
                     self.plan, self._dragged = grown, row + 1
             else:
                 self._dragged = row
@@ -163,7 +163,8 @@ class Drawing:
             self._dragged = None
             self._change(self.plan)
         elif self._dragged is not None:
-            # Handles stay until the end: a browser drops the drag of a node that is sent anew.
+            # Handles are kept until the drag ends: browsers drop the drag of a node that is sent
+            # again.
             x, z = self.plan.corners[self._dragged]
             self._nodes[f"/plan/{kind}_{row}"].position = (x, _HIGH_M, z)
             self._draw_floor(self.plan)
@@ -181,7 +182,7 @@ class Drawing:
 def ground_point(origin_m: Any, direction: Any) -> Point | None:
     """The point x, z of the floor that a ray hits, to the nearest millimetre.
 
-    None if the ray does not meet the floor, or only beyond the ground that is drawn.
+    None if the ray misses the floor, or hits it outside the square of `GROUND_M`.
     """
     start, way = np.asarray(origin_m, dtype=np.float64), np.asarray(direction, dtype=np.float64)
     if start[1] * way[1] >= 0:

@@ -1,4 +1,4 @@
-"""The viewer's logic without its page: rooms of a prior, or of a folder."""
+"""The viewer's logic, without the page: rooms of a prior or of a folder."""
 
 import threading
 from collections.abc import Mapping, Sequence
@@ -30,7 +30,7 @@ PATH_STEPS = 49
 SOME = 64
 """Largest number of training rooms for estimating room sizes; decoding all would take a second."""
 HERE = "here"
-"""Name of the shown room as an end of a path."""
+"""Text that names the shown room as an end of a path."""
 
 
 NOTHING_ASKED: Mapping[str, Any] = MappingProxyType({})
@@ -57,7 +57,7 @@ class Shown:
 
 
 class Folder:
-    """Rooms of a folder of scenes, of any method."""
+    """A folder of scenes, made by any method."""
 
     def __init__(self, scenes: Sequence[Scene]):
         self.scenes = tuple(scenes)
@@ -186,9 +186,9 @@ class Explorer:
         return Shown(room.scene, f"path, step {number} of {PATH_STEPS - 1}")
 
     def complete(self, shown: Shown, seed: int, want: str = "") -> Shown:
-        """Keep the kept objects, and complete the room around them, with wishes if there are any.
+        """Complete the room around the kept objects, with wishes if there are any.
 
-        The shown room's floor, doors, windows and ceiling stay as well.
+        The shown room's floor, doors, windows and ceiling also stay.
         """
         room = self.prior.complete(shown.given(), 1, seed, want=want or None)[0]
         kept = frozenset(range(len(shown.kept)))

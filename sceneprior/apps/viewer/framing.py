@@ -1,4 +1,4 @@
-"""Cameras that hold all of a room, whatever the shape of the browser's window."""
+"""Cameras that show the whole room, for browser windows of any aspect ratio."""
 
 import numpy as np
 from jaxtyping import Float
@@ -10,13 +10,13 @@ from sceneprior.render.topdown import scene_meshes
 FOV_RAD = 0.75
 """Vertical field of view of the camera."""
 ASPECT = 1.3
-"""Width of a window by its height, as long as no browser has told its own."""
+"""Width-to-height ratio of the window, until a browser reports its own."""
 CORNER = np.array([-0.42, -0.62, -0.66])
-"""Viewing direction onto a room alone, as in the pictures of rooms."""
+"""Viewing direction if only a room is shown, as in the pictures of rooms."""
 FRONT = np.array([0.0, -0.6, -0.8])
-"""Viewing direction onto a room beside the map, which faces it."""
+"""Viewing direction if a room is shown beside the map, which faces the camera."""
 DOWN = np.array([0.0, -1.0, -0.01])
-"""Viewing direction onto a plan; straight down would leave open which side is up."""
+"""Viewing direction onto a plan; exactly downwards would leave the up direction undefined."""
 MARGIN = 0.92
 """Share of the window that the points may fill."""
 
@@ -32,7 +32,7 @@ def framed(
     Args:
         forward: Viewing direction, not straight up or down.
         fov_rad: Vertical field of view.
-        aspect: Width of the window by its height.
+        aspect: Width-to-height ratio of the window.
     """
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 1.0, 0.0])
@@ -51,7 +51,7 @@ def framed(
 
 
 def viewing_direction(wxyz: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3"]:
-    """The viewing direction (+z of the camera) of viser's orientation of a camera."""
+    """The viewing direction (the camera's +z) of a camera orientation in viser."""
     w, x, y, z = wxyz
     return np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
 
@@ -67,5 +67,5 @@ def room_bounds(scene: Scene, shell: Shell, walls: bool) -> Float[np.ndarray, "2
 
 
 def box_points(bounds_m: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "8 3"]:
-    """The corners of a box between its lowest and highest one."""
+    """The eight corners of a box, from its lowest and highest corner."""
     return np.stack(np.meshgrid(*bounds_m.T), axis=-1).reshape(8, 3)

@@ -1,4 +1,4 @@
-"""A 2D map of the latent space, by the first two principal components of training rooms."""
+"""A 2D map of the latent space, along the first two principal components of training rooms."""
 
 from dataclasses import dataclass
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _BOX, _KEPT = (120, 120, 120), (230, 120, 20)
 _SAME = 1e-4
-"""Largest difference of vertices, relative to the box, up to which meshes count as equal."""
+"""Maximum difference of vertices, relative to the box, at which meshes count as equal."""
 _EDGES = np.array(BOX_EDGES)
 
 
@@ -73,7 +73,7 @@ class RoomNodes:
         shell: ShellName = "none",
     ) -> None:
         """Show a scene in place of the previous one; objects that the user keeps get an orange box
-        and a name. Without floor and walls, a grid takes their place."""
+        and a name. If neither floor nor walls are shown, a grid is."""
         self._show_shell(shown_shell(scene, shell))
         for row, (item, color) in enumerate(
             zip(scene.objects, object_colors(scene).tolist(), strict=True)
@@ -152,8 +152,8 @@ class RoomNodes:
 def shown_shell(scene: Scene, shell: ShellName) -> dict[str, Mesh]:
     """Floor, walls and ceiling as seen from inside the room, with the frames of its openings.
 
-    Only faces towards the room are left, and browsers draw faces from their front alone: of walls
-    between the camera and the room, no more is drawn than the frames of doors and windows.
+    Only faces towards the room are kept, and browsers draw only front faces. So walls between the
+    camera and the room are invisible, except for the frames of their doors and windows.
     """
     meshes = shell_meshes(scene, shell)
     if shell != "walls":
@@ -163,7 +163,7 @@ def shown_shell(scene: Scene, shell: ShellName) -> dict[str, Mesh]:
     for row, wall in enumerate(room.walls):
         mesh = meshes[f"wall_{row}"]
         outward = _normals(mesh) @ np.insert(wall.outward, 1, 0.0)
-        # The inner face and the reveals of openings, without upper and lower edge and mitred ends.
+        # Keep the inner face and the reveals of openings; drop the edges and the mitred ends.
         y = mesh.vertices_m[mesh.faces].mean(axis=1)[:, 1]
         reveal = (abs(outward) < 0.01) & (y > -THICK_M / 2) & (y < ceiling_m)
         meshes[f"wall_{row}"] = Mesh(mesh.vertices_m, mesh.faces[(outward < -0.99) | reveal])

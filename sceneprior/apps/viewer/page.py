@@ -38,18 +38,18 @@ if TYPE_CHECKING:
 GAP = 0.06
 """Gap between the room and its neighbours, relative to the width of the room's floor."""
 AROUND_PLAN_M = 1.0
-"""Floor shown around a plan that is being drawn."""
+"""Width of the floor shown around a plan that is being drawn."""
 SMALL = 0.55
-"""A room with sides below this share of those of the framed box is framed anew."""
+"""The cameras are framed again if the room's sides fall below this share of the framed box's."""
 
 
 class Page:
     """The page, whose single room is shared by all connected browsers.
 
     Args:
-        models: CAD models, the other choice of `Furniture`; by default the package's own.
-        asked: Request of the first room, as arguments of `Prior.sample`.
-        shell: Parts of the room itself that are shown at first.
+        models: CAD models for the choice `models` of `Furniture`; by default the package's own.
+        asked: Request of the first room, as arguments of `Prior.sample`. shell: Parts of the shell
+        (walls, floor) that are shown initially.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class Page:
         self._bounds_m = np.zeros((2, 3))
         """Lowest and highest corner of the room when it was framed."""
         self._eyes: dict[int, np.ndarray] = {}
-        """Position that each browser's camera was given last."""
+        """Last position that was set for each browser's camera."""
         server.scene.set_up_direction("+y")
         server.initial_camera.fov = FOV_RAD
         server.gui.configure_theme(show_logo=False, show_share_button=False)
@@ -130,10 +130,10 @@ class Page:
     # -- Cameras -----------------------------------------------------------------------------------
 
     def frame(self, turned: bool = False) -> None:
-        """Move all cameras so that everything is seen.
+        """Move all cameras so that everything is visible.
 
         Args:
-            turned: Look in the page's own direction, not in that of each camera.
+            turned: Use the page's viewing direction instead of each camera's current one.
         """
         self._bounds_m = self._room_bounds()
         self._look(self._points(), self._direction if turned else None)
@@ -185,7 +185,8 @@ class Page:
         client.camera.on_update(update)
 
     def _points(self) -> Float[np.ndarray, "points 3"]:
-        """What the cameras hold: the room, the map, and the nearest training room if shown."""
+        """Points that cameras must show: the room, the map, and the nearest training room if
+        shown."""
         points = [box_points(self._room_bounds())]
         half = self._floor_m / 2
         if self.board is not None:

@@ -1,4 +1,4 @@
-"""The panel of the page: new rooms and requests, paths, completion, what is shown, downloads."""
+"""The page's control panel: new rooms, requests, paths, completion, display and downloads."""
 
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from sceneprior.apps.viewer.page import Page
 
 FURNITURE = DECODED, MODELS = "decoded", "models"
-"""The choices of `Furniture`: meshes of the prior or the files, or CAD models."""
+"""The choices of `Furniture`: the meshes of the prior or the scene files, or CAD models."""
 
 
 class Panel:
-    """The controls of a page, and its texts."""
+    """The controls and texts of a page."""
 
     def __init__(self, page: "Page", asked: Mapping[str, Any], shell: ShellName):
         self._page, self._gui = page, page.server.gui
@@ -96,7 +96,7 @@ class Panel:
             self._answer = gui.add_html("")
 
     def _sample(self, explorer: Explorer, seed: int, distribution: str | None) -> None:
-        """Show a new room, or say what is in the way of the request."""
+        """Show a new room, or the reason why the request cannot be met."""
         try:
             asked = {} if self._fields is None else self._fields.asked()
             if asked:

@@ -1,4 +1,4 @@
-"""A floor plan that a user draws: corners, doors and windows, and the texts of a request."""
+"""A floor plan drawn by a user: corners, doors and windows, and conversion from and to text."""
 
 import math
 from collections.abc import Sequence
@@ -20,11 +20,11 @@ from sceneprior.lifted.requests.openings import (
 from sceneprior.lifted.requests.shape import LEAST_AREA_M2, Side, read_floor, sides_of
 
 FIRST = "4x3"
-"""The floor that a drawing begins with."""
+"""Initial floor of a drawing, 4 x 3 metres."""
 GRID_M = 0.1
-"""Distance of the places that a corner may take."""
+"""Grid spacing for corners."""
 STEP_M = 0.05
-"""Distance of the places along a wall that a door or window may take."""
+"""Spacing of the possible positions of a door or window along a wall."""
 
 Point = tuple[float, float]
 
@@ -34,26 +34,26 @@ class Placed(NamedTuple):
 
     kind: str
     side: int
-    """Number of its wall: the side from this corner."""
+    """Index of the wall, which is also the index of the wall's first corner."""
     at_m: float
-    """Distance of its middle from this corner."""
+    """Distance from the wall's first corner to the middle of the opening."""
 
     @property
     def width_m(self) -> float:
-        """Width of a door or window of a request."""
+        """Default width of a requested door or window."""
         return DOOR_M[0] if self.kind == "door" else WINDOW_M[0]
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A floor with doors and windows. Changes return another plan, or the same one if the outline
-    would intersect itself or become too small."""
+    """A floor with doors and windows. Methods that change it return a new plan, or the same plan if
+    the outline would intersect itself or become too small."""
 
     corners: tuple[Point, ...]
-    """Corners x, z in metres, in order round the room."""
+    """Corners x, z in metres, in order around the room."""
     openings: tuple[Placed, ...] = ()
     unplaced: tuple[str, ...] = ()
-    """Texts of openings whose place is drawn at random."""
+    """Texts of openings whose position is drawn at random."""
 
     @property
     def outline_m(self) -> Float[np.ndarray, "corners 2"]:
@@ -62,11 +62,11 @@ class Plan:
 
     @property
     def sides(self) -> list[Side]:
-        """Its walls, the first from corner 0 to corner 1."""
+        """The walls; wall 0 runs from corner 0 to corner 1."""
         return sides_of(self.outline_m)
 
     def floor_text(self) -> str:
-        """The floor as `--floor` takes it: `4x3`, or its corners."""
+        """The floor in the format of `--floor`: `4x3`, or a list of corners."""
         x, z = np.ptp(self.outline_m, axis=0)
         size = f"{_number(x)}x{_number(z)}"
         if len(self.corners) == 4 and np.allclose(read_floor(size), self.outline_m, atol=1e-6):
@@ -74,7 +74,7 @@ class Plan:
         return " ".join(f"{_number(x)},{_number(z)}" for x, z in self.corners)
 
     def openings_text(self) -> str:
-        """The openings as `--openings` takes them."""
+        """The openings in the format of `--openings`."""
         placed = [f"{kind}@{side}:{_number(at_m)}" for kind, side, at_m in self.openings]
         return ", ".join([*placed, *self.unplaced])
 
@@ -85,13 +85,13 @@ class Plan:
         return np.asarray(side.start_m + reach * side.along)
 
     def with_moved(self, corner: int, to: Point) -> "Plan":
-        """A corner moved to the nearest place of the grid."""
+        """Move a corner to the grid point nearest to `to`."""
         corners = [*self.corners]
         corners[corner] = (_on_grid(to[0]), _on_grid(to[1]))
         return self._with_corners(corners, self.openings)
 
     def with_corner(self, side: int, at: Point) -> "Plan":
-        """A new corner on or near a side, which becomes two; its number is `side` + 1."""
+        """Split a side at a new corner near `at`; the new corner's index is `side` + 1."""
         there = (_on_grid(at[0]), _on_grid(at[1]))
         corners = [*self.corners[: side + 1], there, *self.corners[side + 1 :]]
         cut_m = math.dist(self.corners[side], there)
@@ -106,7 +106,7 @@ class Plan:
         return self._with_corners(corners, openings)
 
     def without_corner(self, corner: int) -> "Plan":
-        """A corner left out, if three are left."""
+        """Remove a corner; a triangle stays as it is."""
         count = len(self.corners)
         if count <= 3:
             return self
@@ -123,12 +123,12 @@ class Plan:
         return self._with_corners(corners, openings)
 
     def with_opening(self, kind: str, near: Point) -> "Plan":
-        """A door or a window more, on the wall that is nearest to a point."""
+        """Add a door or a window on the wall nearest to a point."""
         side, at_m = self._on_wall(near)
         return self._fitted([*self.openings, Placed(kind, side, at_m)])
 
     def with_opening_moved(self, number: int, near: Point) -> "Plan":
-        """An opening moved to the place on a wall that is nearest to a point."""
+        """Move an opening to the position on a wall nearest to a point."""
         side, at_m = self._on_wall(near)
         moved = self.openings[number]._replace(side=side, at_m=at_m)
         openings = [*self.openings]
@@ -136,12 +136,12 @@ class Plan:
         return self._fitted(openings)
 
     def without_opening(self, number: int) -> "Plan":
-        """An opening left out."""
+        """Remove a door or a window."""
         left = tuple(each for row, each in enumerate(self.openings) if row != number)
         return replace(self, openings=left)
 
     def centred(self) -> "Plan":
-        """The plan with the middle of its bounding box at the origin, as requested rooms have."""
+        """Move the middle of the bounding box to the origin, as in requested rooms."""
         middle = (self.outline_m.min(axis=0) + self.outline_m.max(axis=0)) / 2
         corners = [(float(x), float(z)) for x, z in self.outline_m - middle]
         return replace(self, corners=tuple(corners))
@@ -159,7 +159,7 @@ class Plan:
         return replace(self, corners=tuple(corners))._fitted(openings)
 
     def _fitted(self, openings: Sequence[Placed]) -> "Plan":
-        """The plan with these openings, moved along their walls until they lie in them."""
+        """Replace the openings by `openings`, shifted along their walls to lie within them."""
         sides = self.sides
         fitted = []
         for each in openings:
@@ -172,7 +172,7 @@ class Plan:
 
 
 def plan_of(floor: str, openings: str) -> Plan:
-    """The plan that the texts of a request describe; without a floor, one to begin with.
+    """Build a plan from the texts of a request; without a floor, it has the floor `FIRST`.
 
     >>> plan = plan_of("4x3", "door@north:1, window")
     >>> plan.openings_text(), plan.with_opening("window", (1.9, 0.2)).openings_text()

@@ -1,4 +1,4 @@
-"""The viewer's server, which answers only its own page, and the check that it can start."""
+"""The viewer's server, which answers only its own page, and a check that the server can start."""
 
 import contextlib
 import functools

@@ -45,7 +45,7 @@ def room_words(shown: Shown, scene: Scene) -> Markup:
 
 
 def floor_words(scene: Scene) -> Markup:
-    """The extents of a room's floor, with its doors and windows; empty if it is not known."""
+    """The extents of a room's floor, and its doors and windows; empty if the floor is unknown."""
     if scene.floor_m is None:
         return Markup()
     x, z = np.ptp(scene.floor_m, axis=0)
@@ -57,14 +57,14 @@ def floor_words(scene: Scene) -> Markup:
 
 
 def wish_words(scene: Scene) -> Markup:
-    """The wishes of a requested room, each with a mark that says whether it holds."""
+    """The wishes of a requested room, each marked as fulfilled or not."""
     wishes: Any = scene.extra.get("wishes")
     if not isinstance(wishes, list) or not wishes:  # a file may hold anything
         return Markup()
     lines = [
         Markup("<li>✓ {}</li>").format(_wish(each))
         if each.get("holds") is True
-        else Markup("<li>{}</li>").format(_WORSE.format(f"✗ {_wish(each)} does not hold"))
+        else Markup("<li>{}</li>").format(_WORSE.format(f"✗ {_wish(each)}: not fulfilled"))
         for each in wishes
         if isinstance(each, dict)
     ]
@@ -76,5 +76,5 @@ def _wish(entry: dict[str, Any]) -> str:
 
 
 def error_words(sentence: str) -> Markup:
-    """A sentence on what is in the way of a request."""
+    """Format the reason why a request cannot be met."""
     return _WORSE.format(sentence)

@@ -22,7 +22,7 @@ LEAST_LOG_SCALE = -7.0
 
 @dataclass(frozen=True)
 class LogisticMixture:
-    """K weighted logistics per number."""
+    """A mixture of K weighted logistics for each number."""
 
     weight_logits: Float[Tensor, "*batch mixtures"]
     means: Float[Tensor, "*batch mixtures"]

@@ -15,7 +15,7 @@ POOLING = 2
 maps, which would otherwise distinguish them from rendered ones."""
 
 SIGMA_PX2 = 0.25
-"""Softness of rendered edges, about that of a pooled hard edge: coverage rises from 0.27 to 0.73
+"""Softness of rendered edges, chosen to match pooled hard edges: coverage rises from 0.27 to 0.73
 between half a pixel outside and half a pixel inside."""
 
 
@@ -39,7 +39,7 @@ def rendered_maps(
     classes: Float[Tensor, "rooms objects classes"],
     mode: str = "fast",
 ) -> Float[Tensor, "rooms views classes height width"]:
-    """Maps of decoded scenes, one per room, in the cameras of the views.
+    """Maps of decoded scenes, one scene per room, rendered in the cameras of the views.
 
     They have the size of observed maps. `kept` and `classes` come from `choices`; `mode` is passed
     to `render_scene`.
@@ -60,7 +60,7 @@ def rendered_maps(
     )
     coverage = alone.masks[:, :, 0].unflatten(0, (-1, objects)).transpose(1, 2)
     depth_m = alone.depth_m.unflatten(0, (-1, objects)).transpose(1, 2)
-    # Pixels that only the soft edge covers have no depth; they get that of the object's centre.
+    # Pixels covered only by the soft edge have no depth; they get the depth of the object's centre.
     centers = project(scenes.centers_m.unsqueeze(2), views.world_to_camera, views.intrinsics)
     depth_m = depth_m.where(depth_m.isfinite(), centers[..., 2:].detach())
     return compose_maps(coverage, depth_m, kept, classes)
@@ -115,8 +115,8 @@ def compose_maps(
 
         visible_k = a_k * prod_{j nearer than k} (1 - a_j),    a_k = kept_k coverage_k
 
-    a_k is the object's coverage when rendered alone, if it exists; depths have no gradient. Objects
-    have no share of `void`, which is the rest of the pixel, so that the classes of a map sum to 1.
+    a_k is the object's coverage when rendered alone, or 0 if the object does not exist. Depths have
+    no gradient. `void` gets the rest of the pixel, so that the classes of a map sum to 1.
     """
     alpha = coverage * kept[:, None, :, None, None]
     order = depth_m.argsort(dim=2)

@@ -51,8 +51,8 @@ START_ROOMS = 64
 """Number of random rooms over which the outputs are set to `STARTS`."""
 
 SHAPE_RATE = 0.1
-"""Learning rate of the shape decoder relative to that of the generator. It is low, because semantic
-maps do not rule out sheared boxes."""
+"""Learning rate of the shape decoder, relative to the generator's. It is low, because semantic maps
+do not rule out sheared boxes."""
 
 LOGIT_PENALTY = 0.01
 """Weight of `logit_penalty`. Without it, choices could become almost certain and lose their
@@ -74,7 +74,7 @@ class GanTraining(TrainConfig):
 
     epochs: int = Field(400, ge=1)
     batch_size: int = Field(16, ge=1)
-    """Real rooms per step, and as many generated ones."""
+    """Number of real rooms per step; equally many rooms are generated."""
     accumulate: Literal[1] = 1
     """Every batch updates both networks."""
     views_per_room: int = Field(4, ge=1)
@@ -95,7 +95,7 @@ class GanTraining(TrainConfig):
     """Standard deviation of the noise on all maps at the start; it falls to 0 over the epochs.
     Without it, classes can be lost permanently."""
     clip_gradient: float = Field(1.0, ge=0)
-    """Norm to which the gradients of each network are clipped; 0 turns clipping off."""
+    """Maximum gradient norm of each network; 0 turns clipping off."""
     silhouettes: Literal["exact", "fast"] = "fast"
     """See `ShapeConfig`."""
 
@@ -155,7 +155,7 @@ class GanStage(lightning.LightningModule):
         generator_optimizer, discriminator_optimizer = self.optimizers()  # type: ignore[attr-defined]
         scenes = self.generator.decode(self._latents(len(views.room_index)))
         with full_precision(self.device):
-            # Checked before rendering, which rejects vertices that are not finite.
+            # This is checked before rendering, which rejects vertices that are not finite.
             undecided = logit_penalty(scenes)
             check_finite(undecided + scenes.centers_m.sum() + scenes.sizes_m.sum(), views)
             real = observed_maps(views, self.classes)

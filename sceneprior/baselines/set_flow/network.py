@@ -18,12 +18,12 @@ from sceneprior.core.views import RoomBoxes
 from sceneprior.paper.layers import mlp
 
 NUMBERS = 8
-"""Continuous values of a token, before the class: centre, log extents, cosine and sine of the yaw.
+"""Number of continuous values at the start of a token: centre, log extents, cosine and sine of yaw.
 """
 PARTS = {"position": slice(0, 3), "size": slice(3, 6), "angle": slice(6, 8)}
-"""Slices of these values whose losses are logged separately."""
+"""Slices of the continuous values; the loss of each is logged separately."""
 WAVE = 4.0
-"""Half a period of the slowest Fourier feature, in standard deviations of a value."""
+"""Half the period of the slowest Fourier feature, in standard deviations of a value."""
 LEAST_SPREAD = 1e-3
 """Minimum standard deviation by which values are divided."""
 BATCH = 256

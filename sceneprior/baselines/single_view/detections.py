@@ -39,11 +39,11 @@ class Detections:
     views: SceneViews
     image: Int[Tensor, " masks"]
     slot: Int[Tensor, " masks"]
-    """Index among the masks of its image."""
+    """Index of the mask within its image."""
     room: Int[Tensor, " masks"]
     view: Int[Tensor, " masks"]
     item: Int[Tensor, " masks"]
-    """Index of its object in the room."""
+    """Index of the mask's object in the room."""
     object_class: Int[Tensor, " masks"]
     boxes: Float[Tensor, "masks 4"]
     """2D boxes in the format of `SceneViews`, relative to the image."""
@@ -60,8 +60,8 @@ class Detections:
 
     @property
     def numbers(self) -> Float[Tensor, "masks numbers"]:
-        """The 2D box (4), the logs of its width and height (2), its clear sides (4), the rays
-        through its middle and corners (15), and the camera's height (1)."""
+        """The 2D box (4), the logs of its width and height (2), its sides that no other object
+        touches (4), the rays through its centre and corners (15), and the camera's height (1)."""
         x1, y1, x2, y2 = self.boxes.unbind(dim=-1)
         corners = [((x1 + x2) / 2, (y1 + y2) / 2), (x1, y1), (x2, y1), (x1, y2), (x2, y2)]
         rays = self.rays(torch.stack([torch.stack(place, dim=-1) for place in corners], dim=1))
@@ -71,7 +71,7 @@ class Detections:
 
     @property
     def crops(self) -> Float[Tensor, "masks channels rows columns"]:
-        """Each 2D box with its border, stretched to a square, see `CHANNELS`."""
+        """Each 2D box with its border, stretched to a square of `CROP` pixels; see `CHANNELS`."""
         ids = self.views.observed_ids[self.room, self.view]
         steps = (torch.arange(CROP, device=ids.device) + 0.5) / CROP
         steps = steps * (1 + 2 * MARGIN) - MARGIN
@@ -126,11 +126,11 @@ class Detections:
         return offsets * ahead.unsqueeze(-1), away.norm(dim=-1), ahead
 
     def to_frame(self, vectors: Float[Tensor, "masks *many 3"]) -> Float[Tensor, "masks *many 3"]:
-        """Directions turned from the room into the images' frames."""
+        """Rotate directions from the room frame into the images' frames."""
         return turn_vectors(vectors, self.quarter)
 
     def to_room(self, vectors: Float[Tensor, "masks *many 3"]) -> Float[Tensor, "masks *many 3"]:
-        """Directions turned from the images' frames into the room."""
+        """Rotate directions from the images' frames into the room frame."""
         return turn_vectors(vectors, (QUARTERS - self.quarter) % QUARTERS)
 
     def padded(self, values: Float[Tensor, "masks width"]) -> Float[Tensor, "images most width"]:
@@ -148,7 +148,7 @@ class Detections:
 
 
 def some_views(views: SceneViews, part: slice) -> SceneViews:
-    """The batch with some of each room's views."""
+    """The batch, reduced to the views `part` of each room."""
     return replace(
         views,
         world_to_camera=views.world_to_camera[:, part],

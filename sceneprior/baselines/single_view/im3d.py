@@ -136,7 +136,7 @@ class SceneGraph(nn.Module):
 
 
 class Blobs(nn.Module):
-    """The Gaussians of each mask's shape, from its features."""
+    """Predicts the Gaussians of each mask's shape from the mask's features."""
 
     start: Tensor
 
@@ -175,7 +175,7 @@ def cell_centers(cells: int) -> Float[Tensor, "points 3"]:
 
 
 class Im3d(ViewNetwork):
-    """The detector, the graph, and the shape of each object from the graph's nodes."""
+    """Detects boxes, refines them over the graph, and predicts shapes from the graph's nodes."""
 
     def __init__(self, config: Im3dModel, classes: int):
         super().__init__()

@@ -37,8 +37,8 @@ class SingleViewModel(Section):
 
 
 class SingleViewTraining(OneStageTraining):
-    """Settings of one network's training. `data.views_per_room` and `data.mask_step` set which
-    views and which pixels it sees."""
+    """Training settings. `data.views_per_room` sets the number of views per step, and
+    `data.mask_step` the resolution of their masks."""
 
     learning_rate: float = Field(1e-3, gt=0)
     schedule: Literal["constant", "cosine"] = "cosine"
@@ -60,7 +60,7 @@ class SingleViewConfig(OneStageConfig):
         if self.data.augment_rotations:
             raise ValueError(
                 f"data.augment_rotations is true, but method: {self.method} sees each room turned "
-                "until the camera looks along +z, so that turned copies are all the same to it; "
+                "until the camera looks along +z, so turned copies would all be the same; "
                 "set it to false"
             )
         return self
@@ -125,8 +125,8 @@ class ViewNetwork(nn.Module, ABC):
 
 
 class DetectionEncoder(nn.Module):
-    """Features of each mask by itself. A small convolutional network reads the mask's crop, and a
-    linear layer its 2D box, rays and class. The published networks read colours with a ResNet
+    """Encodes each mask independently: a small convolutional network reads the mask's crop, and a
+    linear layer reads its 2D box, rays and class. The published networks read colours with a ResNet
     instead."""
 
     def __init__(self, classes: int, width: int):

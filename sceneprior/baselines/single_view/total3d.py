@@ -39,7 +39,7 @@ log distance, because far distances are known less exactly than near ones."""
 BIN = math.log(FURTHEST_M / NEAREST_M) / BINS
 """Width of a bin of log distances."""
 GEOMETRY = 64
-"""Number of sines and cosines that encode the four numbers by which two 2D boxes are related."""
+"""Number of sines and cosines that encode the four numbers relating two 2D boxes."""
 
 
 class DetectorModel(SingleViewModel):
@@ -65,8 +65,8 @@ class DetectorTraining(SingleViewTraining):
     """Weight of each mean distance between predicted and true box corners, in metres."""
 
     def weights(self, losses: Iterable[str]) -> dict[str, float]:
-        """Weight of each loss: the setting of the same name, ignoring the prefix `refined_`; `box`
-        if there is none."""
+        """Weight of each loss: the setting of the same name, ignoring the prefix `refined_`, or
+        `box` if no setting has that name."""
         return {name: getattr(self, name.removeprefix("refined_"), self.box) for name in losses}
 
 
@@ -109,7 +109,7 @@ class Estimate(NamedTuple):
     log_sizes: Float[Tensor, "masks 3"]
     bin_logits: Float[Tensor, "masks bins"]
     residuals: Float[Tensor, "masks bins"]
-    """For each bin, the distance from its middle, in bins."""
+    """For each bin, the offset of the log distance from the bin's middle, in bin widths."""
 
     def boxes(self, bins: Int[Tensor, " masks"] | None = None) -> CameraBoxes:
         """Boxes whose distances lie in the most likely bins, or in the given `bins`."""
@@ -154,8 +154,8 @@ def presence(found: Detections) -> Bool[Tensor, "images most"]:
 
 
 def pair_geometry(found: Detections) -> Float[Tensor, "images most most numbers"]:
-    """Sines and cosines that relate the 2D boxes of each pair of an image's masks: of log distances
-    between their middles and of log ratios of their sides."""
+    """Sine-cosine encoding of the relation between the 2D boxes of each pair of an image's masks:
+    log distances between their middles, and log ratios of their sides."""
     boxes = found.padded(found.boxes)
     sides = (boxes[..., 2:] - boxes[..., :2]).clamp(min=1e-3)
     middles = (boxes[..., 2:] + boxes[..., :2]) / 2
@@ -168,7 +168,7 @@ def pair_geometry(found: Detections) -> Float[Tensor, "images most most numbers"
 
 
 class Detector(nn.Module):
-    """Features of masks, attention between them, and one layer that predicts boxes."""
+    """Encodes masks, applies attention between them, and predicts boxes with one layer."""
 
     mean_log_sizes: Tensor
 
@@ -225,14 +225,15 @@ def true_objects(found: Detections, batch: TrueViews) -> TrueObjects:
 
 
 def mean_of_masks(values: Tensor, counted: Tensor | None = None) -> Float[Tensor, ""]:
-    """Mean over the masks that count and over all further dimensions; 0 if no mask counts."""
+    """Mean over the masks in `counted` (None: all) and over all further dimensions; 0 if there are
+    no such masks."""
     values = values.flatten(1).mean(dim=1) if values.ndim > 1 else values
     weights = torch.ones_like(values) if counted is None else counted.to(values)
     return (values * weights).sum() / weights.sum().clamp(min=1)
 
 
 def smooth_l1(values: Tensor, target: Tensor, counted: Tensor | None = None) -> Float[Tensor, ""]:
-    """Mean smooth L1 distance over the masks that count."""
+    """Mean smooth L1 distance over the masks in `counted` (None: all)."""
     return mean_of_masks(F.smooth_l1_loss(values, target, reduction="none"), counted)
 
 
@@ -285,7 +286,7 @@ class Total3dConfig(DetectorConfig):
 
 
 class Total3d(ViewNetwork):
-    """The detector, and meshes deformed from a sphere."""
+    """Detects boxes and deforms a sphere into a mesh for each box."""
 
     def __init__(self, config: Total3dModel, classes: int):
         super().__init__()

@@ -25,8 +25,8 @@ POINTS = 256
 CELLS = 16
 """Cells along each axis of an object's grid."""
 DENSE = 12288
-"""Number of surface points by which occupied cells are found: about eight per cell of a cube's
-surface."""
+"""Number of surface points from which occupied cells are found: about eight per surface cell of a
+cube."""
 
 
 class TrueViews(NamedTuple):
@@ -81,7 +81,8 @@ def _read(folder: Path, shard: Any, room_id: str) -> tuple[np.ndarray, np.ndarra
     occupied = np.empty((len(boxes_m), CELLS, CELLS, CELLS), bool)
     for row, item in enumerate(scene.objects):
         mesh, half_m = object_mesh(item), np.maximum(item.size_m, 1e-6) / 2
-        # Scaled to the cube first, or the small sides of a flat piece would get few points.
+        # The mesh is scaled to the cube first; otherwise the thin sides of a flat piece would get
+        # few points.
         unit = (mesh.vertices_m - np.asarray(item.center_m)) / half_m
         occupied[row] = filled(surface_points(unit, mesh.faces, DENSE), CELLS)
         surface = surface_points(mesh.vertices_m, mesh.faces, POINTS)

@@ -49,13 +49,13 @@ class UslTraining(SingleViewTraining):
 
     epochs: int = Field(200, ge=1)
     box: float = Field(5.0, ge=0)
-    """Weight of 2D boxes in the other views. It is needed because silhouettes that miss their masks
-    have no gradient."""
+    """Weight of the 2D-box loss in the other views, needed because silhouettes that miss their
+    masks have no gradient."""
     frustum: float = Field(1.0, ge=0)
-    """Weight of the frustum loss, for objects that are visible in another view while their
-    prediction lies outside it."""
+    """Weight of the frustum loss, for objects that are visible in another view but predicted
+    outside its frustum."""
     mask: float = Field(1.0, ge=0)
-    """Weight of silhouettes in the other views."""
+    """Weight of the silhouette loss in the other views."""
     occlusion_slack: float = Field(0.15, ge=0, le=1)
     """See `LossConfig`."""
     silhouettes: Literal["exact", "fast"] = "fast"
@@ -131,7 +131,7 @@ def other_view_losses(
     """Losses in the other views, as means over objects: 2D boxes, rays to objects predicted outside
     a view, and silhouettes.
 
-    Each silhouette is drawn alone. The object may continue behind other objects, so pixels that
+    Each silhouette is rendered alone. The object may continue behind other objects, so pixels that
     show another object are left out:
 
         L_mask = 1 - IoU(silhouette, mask) over the remaining pixels

@@ -1,7 +1,7 @@
-"""The network of the Sync2Gen-style baseline: a VAE of rooms as matrices.
+"""The network of the Sync2Gen-style baseline: a VAE that represents each room as a matrix.
 
 Source: Yang et al., "Scene Synthesis via Uncertainty-Driven Attribute Synchronization", ICCV 2021;
-docs/baselines_3d.md lists our choices where it is ambiguous.
+docs/baselines_3d.md lists our choices where the paper is ambiguous.
 """
 
 import torch
@@ -16,7 +16,7 @@ from sceneprior.core.views import RoomBoxes
 from sceneprior.paper.layers import mlp
 
 ATTRIBUTES = 7
-"""Numbers of a slot: existence, centre x, y, z, full extents along x, y, z."""
+"""Number of attributes of a slot: existence, centre x, y, z, full extents along x, y, z."""
 READS = 4
 """Number of input groups connected to each output of a sparse layer."""
 HIDDEN_GROUP = 8
@@ -48,12 +48,13 @@ class Sync2genModel(Section):
 
 
 class Sync2Gen(nn.Module):
-    """A variational auto-encoder of rooms, with `slots` slots per class that are filled or empty.
+    """A variational auto-encoder of rooms.
 
-    Attributes are standardised per class. Objects of a class fill its slots from left to right (by
-    x, then z); beyond `slots`, the rightmost are left out. Sparse and full layers alternate, which
-    reduces overfitting. `seed` chooses the connections of sparse layers and the offsets that
-    `PairPrior` keeps. `classes` is the size of the label set with void.
+    A room is a matrix with `slots` slots per class; each slot holds the attributes of one object,
+    standardised per class, or is empty. Objects of a class fill its slots in order of x, then z;
+    those beyond the last slot are left out. Sparse and dense layers alternate, which reduces
+    overfitting. `seed` chooses the connections of sparse layers and the offsets that `PairPrior`
+    keeps. `classes` is the size of the label set with void.
     """
 
     mean_m: Tensor
@@ -82,7 +83,8 @@ class Sync2Gen(nn.Module):
         )
 
     def fit_statistics(self, rooms: RoomBoxes) -> None:
-        """Set means and spreads of each class and offsets of class pairs from training rooms."""
+        """Compute each class's means and standard deviations, and the offsets of class pairs, from
+        training rooms."""
         for label in range(1, self.classes):
             mine = rooms.boxes_m[rooms.is_object & (rooms.object_class == label)]
             if len(mine):
@@ -92,7 +94,7 @@ class Sync2Gen(nn.Module):
         self.pairs.fit(rooms, self.seed)
 
     def to_matrix(self, rooms: RoomBoxes) -> Float[Tensor, "rooms classes slots 7"]:
-        """Rooms as matrices, which are bit-identical for any order of the objects."""
+        """Convert rooms to matrices, which are bit-identical for any order of the objects."""
         label = rooms.object_class.where(rooms.is_object, self.classes)
         order = torch.arange(label.shape[1], device=label.device).expand_as(label)
         # The sort is stable, so the last key is the primary one.
@@ -104,7 +106,7 @@ class Sync2Gen(nn.Module):
         row = (label - 1).clamp(max=self.classes - 2)
         unit = (rooms.boxes_m - self.mean_m[row, 0]) / self.spread_m[row, 0]
         cell = torch.cat([torch.ones_like(unit[..., :1]), unit], dim=-1)
-        # Objects without a slot go to an extra one after the last, which is cut off below.
+        # Objects without a slot go to an extra slot after the last, which is cut off below.
         last = (self.classes - 1) * self.slots
         slot = (row * self.slots + rank).where(fits, last)
         matrix = cell.new_zeros(len(label), last + 1, ATTRIBUTES)
@@ -119,7 +121,7 @@ class Sync2Gen(nn.Module):
         return mean, log_variance.clamp(-10, 10)
 
     def decode(self, z: Float[Tensor, "rooms latent"]) -> Float[Tensor, "rooms classes slots 7"]:
-        """Matrices whose first attribute is the logit of a slot's existence."""
+        """Decode latents to matrices whose first attribute is the logit of a slot's existence."""
         return self.decoder(z).unflatten(-1, (self.classes - 1, self.slots, ATTRIBUTES))
 
     def losses(
@@ -129,7 +131,7 @@ class Sync2Gen(nn.Module):
         mean: Float[Tensor, "rooms latent"],
         log_variance: Float[Tensor, "rooms latent"],
     ) -> dict[str, Float[Tensor, " rooms"]]:
-        """Losses of each room: existence over all slots, attributes over the filled ones."""
+        """Losses of each room: existence over all slots, other attributes over filled slots."""
         exists = matrix[..., 0]
         off = F.smooth_l1_loss(decoded[..., 1:], matrix[..., 1:], reduction="none")
         off = off * exists.unsqueeze(-1)
@@ -187,7 +189,7 @@ class SparseLinear(nn.Linear):
         generator = torch.Generator().manual_seed(seed)
         seen = torch.rand(outputs, groups, generator=generator).argsort(dim=1) < reads
         self.register_buffer("mask", seen.repeat_interleave(group, dim=1).float())
-        with torch.no_grad():  # the initial scale of a layer with as many inputs
+        with torch.no_grad():  # the usual initial scale for this number of connected inputs
             self.weight.mul_((groups / reads) ** 0.5)
 
     def forward(self, x: Float[Tensor, "*batch inputs"]) -> Float[Tensor, "*batch outputs"]:

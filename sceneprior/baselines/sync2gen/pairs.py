@@ -1,8 +1,8 @@
 """Offsets between pairs of furniture in training rooms, and their use to refine new rooms.
 
-This is a small form of Sync2Gen's synchronisation. Absolute positions are as uncertain as the
-decoder's errors are large, and relative positions as uncertain as offsets in training rooms vary.
-docs/baselines_3d.md names what is left out.
+This is a reduced form of Sync2Gen's synchronisation: positions stay near the decoded ones, within
+the decoder's mean squared error, and offsets follow their distribution in training rooms.
+docs/baselines_3d.md lists the omissions.
 """
 
 from dataclasses import replace
@@ -14,7 +14,8 @@ from torch import Tensor, nn
 from sceneprior.core.views import RoomBoxes
 
 COMPONENTS = 64
-"""Offsets kept per pair of classes, each the mean of one Gaussian of the pair's mixture."""
+"""Number of offsets kept per pair of classes; each is the mean of one Gaussian of the pair's
+mixture."""
 BANDWIDTH_M = 0.15
 ANYWHERE = 0.05
 """Weight of a uniform density over `AREA_M2` in each mixture, which bounds the pull of a pair."""
@@ -25,7 +26,7 @@ BATCH = 64
 
 
 class PairPrior(nn.Module):
-    """Per pair of classes, a mixture of Gaussians over the offset between centres in x and z."""
+    """Gaussian mixtures of the offset between two centres in x and z, one per pair of classes."""
 
     offsets_m: Tensor
     known: Tensor
@@ -84,8 +85,8 @@ class PairPrior(nn.Module):
         for part in rooms.split(BATCH):
             start_m = part.boxes_m[..., [0, 2]]
             part = replace(part, boxes_m=part.boxes_m.clone().requires_grad_())
-            # Adam updates each number by its own gradient: a room does not depend on the others in
-            # its batch, and heights and sizes, which have no gradient, stay.
+            # Adam updates each number from its own gradient, so rooms in a batch do not affect each
+            # other, and heights and sizes, which have no gradient, do not change.
             optimizer = torch.optim.Adam([part.boxes_m], lr=STEP_M)
             for _ in range(steps):
                 optimizer.zero_grad()

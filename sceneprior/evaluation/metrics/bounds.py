@@ -1,4 +1,4 @@
-"""Objects that reach out of the floor, by points of their surfaces: SceneEval's OOB."""
+"""SceneEval's OOB: objects whose surface extends beyond the floor."""
 
 import numpy as np
 import shapely
@@ -11,9 +11,9 @@ from sceneprior.evaluation.metric import USED, Counts, Metric
 from sceneprior.evaluation.surfaces import FLUSH_M, own_box, triangles_of
 
 INSIDE_SHARE = 0.99
-"""Smallest share of an object's points over the floor for an object in bounds."""
+"""Minimum share of an object's surface points above the floor for the object to be in bounds."""
 POINTS_PER_M3, FEWEST_POINTS = 5000, 1000
-"""Points per cubic metre of the object's box, and their smallest number."""
+"""Surface points per cubic metre of the object's box, and their minimum number."""
 
 
 def out_of_bounds(scene: Scene) -> Bool[np.ndarray, " objects"] | None:
@@ -25,8 +25,8 @@ def out_of_bounds(scene: Scene) -> Bool[np.ndarray, " objects"] | None:
     Source:
         3dlg-hcvc/SceneEval, metrics/out_of_bound.py. There the box is the smallest oriented one,
         and the floor lies at the lowest point of all objects, so that no point is below it; here
-        the box is the object's own (axis-aligned if its yaw is unknown), and the floor counts
-        at any height, too. Here the floor is 1 mm wider on all sides (`FLUSH_M`).
+        the box is the object's own (axis-aligned if its yaw is unknown), heights are ignored, and
+        the floor is 1 mm wider on all sides (`FLUSH_M`).
     """
     floor = floor_polygon(scene)
     if floor is None:
@@ -53,6 +53,6 @@ def _oob(scene: Scene) -> Counts:
 METRICS = (
     Metric(
         "sceneeval_oob_objects", "OOB: objects out of bounds (SceneEval)",
-        "share; known floors alone", "lower", _oob, USED,
+        "share; known floors only", "lower", _oob, USED,
     ),
 )  # fmt: skip

@@ -1,6 +1,6 @@
 """Scene classification accuracy (SCA) of a classifier that separates generated from real rooms.
 
-It is 0.5 if the two sets are indistinguishable, and 1 if they are always told apart.
+It is 0.5 if the two sets are indistinguishable, and 1 if every room is classified correctly.
 """
 
 from collections.abc import Callable
@@ -23,8 +23,8 @@ REPEATS = 5
 """Repetitions, each with new folds and a new subset of the larger set, as large as the smaller
 set."""
 INVERSE_PENALTY = 0.01
-"""scikit-learn's C of the linear classifier, on standardized features. It is small, a strong
-regularisation, because there are often fewer rooms than features."""
+"""scikit-learn's C of the linear classifier, on standardized features. A small C means strong
+regularisation, which is needed because there are often fewer rooms than features."""
 
 Classify = Callable[[np.ndarray, np.ndarray, np.ndarray, int], np.ndarray]
 """(training inputs, their 0/1 labels, inputs to classify, seed) -> 0/1 answers."""
@@ -32,7 +32,7 @@ Classify = Callable[[np.ndarray, np.ndarray, np.ndarray, int], np.ndarray]
 
 @dataclass(frozen=True)
 class CrossValidated:
-    """For each room, the numbers of all and of correct predictions made while it was held out."""
+    """Numbers of all and of correct predictions for each room while it was held out."""
 
     right_generated: Int[np.ndarray, " n"]
     asked_generated: Int[np.ndarray, " n"]
@@ -64,7 +64,7 @@ def cross_validated_predictions(
     classify: Classify = linear,
     repeats: int = REPEATS,
 ) -> CrossValidated:
-    """Classify each room by a classifier trained on the other folds.
+    """Classify each room with a classifier trained on the other folds.
 
     The sets are features or small pictures, at least two rows each. Both contribute the same number
     of rooms to every training, so that a constant prediction has accuracy 0.5.
@@ -121,7 +121,7 @@ METRICS = (
             "the larger set as the smaller one has; interval: over rooms, classifiers not retrained"
         },
         column=TableColumn(
-            "SCA", 2, "SCA: accuracy of a classifier that tells generated from test rooms"
+            "SCA", 2, "SCA: accuracy of a classifier that separates generated and test rooms"
         ),
     ),
 )  # fmt: skip

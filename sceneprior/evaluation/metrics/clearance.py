@@ -1,4 +1,4 @@
-"""Doors and windows with nothing before them: SceneEval's opening clearance."""
+"""SceneEval's opening clearance: doors and windows with no object in front of them."""
 
 from typing import NamedTuple
 
@@ -13,36 +13,37 @@ from sceneprior.evaluation.metric import USED, Counts, Metric
 from sceneprior.evaluation.surfaces import Triangles, own_box, triangles_of
 
 BEFORE_WINDOW_M = 0.5
-"""Depth of the space before a window; before a door, it is the door's width."""
+"""Depth of the space in front of a window; in front of a door, it is the door's width."""
 TEST_M = 0.1
 """Distance from an opening at which a point is tested for being in the room."""
 PIXELS_PER_M = 100
 POINTS_PER_M3, FEWEST_POINTS = 5000, 64
-"""Points in an object's box by which its intersection with the space is found."""
+"""Test points per cubic metre of an object's box, and their minimum number."""
 TOLERANCE_M = 1e-6
 
 
 class Clearance(NamedTuple):
-    """One opening: whether an object is before it, and which share of it objects cover."""
+    """Result for an opening: if an object stands in front of it, and the share of its area
+    covered."""
 
     blocked: bool
     covered: float
 
 
 def clearances(scene: Scene) -> list[Clearance]:
-    """Test the space before each door and window, inside the room: SceneEval's opening clearance.
+    """Test the space in front of each door and window, inside the room.
 
-    The space is as wide and high as the opening, and as deep as a door is wide; before windows
-    0.5 m. Points in an object's box (5,000 for each cubic metre, 64 at least, drawn at random) say
-    whether the object reaches into it. Of such objects, all triangles that lie in the space's depth
-    at least in part are projected onto the opening, on a grid of 100 pixels a metre. An opening is
-    blocked if an object has such triangles, and `covered` is the share of its pixels that they
-    cover. An opening without the room on either side has no entry.
+    The space is as wide and high as the opening. Its depth is the door's width, or 0.5 m for a
+    window. An object reaches into the space if one of the random points in its box does (5,000 per
+    cubic metre, at least 64). The triangles of such objects that lie at least partly within the
+    space's depth are projected onto the opening, on a grid of 100 pixels per metre. The opening is
+    blocked if there are such triangles, and `covered` is the share of its pixels that they cover.
+    An opening with the room on neither side has no entry.
 
     Source:
         3dlg-hcvc/SceneEval, metrics/opening_clearance.py, with its default settings: only the side
-        in the room. Openings are 1 mm thick there, which adds 0.5 mm to the depth, and have no
-        thickness here.
+        in the room. SceneEval's openings are 1 mm thick, which adds 0.5 mm to the depth; here they
+        have no thickness.
     """
     floor = floor_polygon(scene)
     if floor is None or not scene.openings:
@@ -69,7 +70,7 @@ def clearances(scene: Scene) -> list[Clearance]:
 
 
 class _Frame(NamedTuple):
-    """Coordinates before an opening: along it, above its lower edge, and into the room."""
+    """Coordinate frame of an opening: along it, above its lower edge, and into the room."""
 
     origin_m: Float[np.ndarray, "3"]
     axes: Float[np.ndarray, "3 3"]
@@ -124,10 +125,10 @@ def _clearance(scene: Scene) -> Counts:
 METRICS = (
     Metric(
         "sceneeval_clear_openings", "Doors and windows with nothing before them (SceneEval)",
-        "share; known openings alone", "higher", _clearance, USED,
+        "share; known openings only", "higher", _clearance, USED,
     ),
     Metric(
         "sceneeval_covered_openings", "Area of doors and windows that is covered (SceneEval)",
-        "share; known openings alone", "lower", _clearance, USED,
+        "share; known openings only", "lower", _clearance, USED,
     ),
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Objects that collide, by their meshes: SceneEval's COL, and PhyScene's Col_obj and Col_scene."""
+"""Collisions between meshes: SceneEval's COL, and PhyScene's Col_obj and Col_scene."""
 
 from itertools import combinations
 
@@ -18,21 +18,21 @@ from sceneprior.evaluation.surfaces import (
 )
 
 SEPARATION_M = 0.005
-"""Distance by which SceneEval moves one of two objects that meet before it tests them again."""
+"""Distance by which two touching objects are moved apart before they are tested again."""
 
 
 def colliding(scene: Scene) -> Bool[np.ndarray, " objects"]:
-    """True for objects whose surface meets another object's: SceneEval's COL.
+    """True for objects whose surface intersects another object's: SceneEval's COL.
 
-    Two objects collide if a triangle of one meets a triangle of the other (touching counts), and if
-    that is still so after the second object is moved by 5 mm, from the mean of the contact points
-    towards its own centroid. So objects that touch, or overlap by up to about 5 mm, do not collide;
-    neither does an object that lies wholly inside another one, whose surface it does not meet.
+    Two objects collide if their triangles intersect or touch, and still do so after the second
+    object is moved by 5 mm, from the mean of the contact points towards its own centroid. So
+    objects that touch, or overlap by up to about 5 mm, do not collide; nor does an object that lies
+    wholly inside another, because their surfaces do not intersect.
 
     Source:
-        3dlg-hcvc/SceneEval, metrics/collision.py. It takes contact points from the library FCL;
-        here they are the points in which edges pass through triangles, and, where none does, the
-        middles of the triangles that meet.
+        3dlg-hcvc/SceneEval, metrics/collision.py. SceneEval takes contact points from the library
+        FCL; here they are the points where edges pass through triangles or, without such points,
+        the centroids of the touching triangles.
     """
     surfaces = [triangles_of(item) for item in scene.objects]
     found = np.zeros(len(surfaces), dtype=bool)
@@ -58,16 +58,16 @@ def _collide(a: Triangles, b: Triangles) -> bool:
 
 
 def containing(scene: Scene) -> Bool[np.ndarray, " objects"]:
-    """True for objects that hold a vertex of a later object, or have one in an earlier object:
-    PhyScene's test of collisions.
+    """True for both objects of a pair if the earlier one contains a vertex of the later one:
+    PhyScene's collision test.
 
     Only vertices of the later object of a pair are tested, as in the published code, so two boxes
     that cross without a corner inside each other are missed.
 
     Source:
         PhyScene/PhyScene, scripts/eval/calc_ckl.py, `overlap_type: mesh` (Yang et al., CVPR 2024).
-        It tests against closed remeshed models; here a point is inside if the winding number of the
-        mesh as it is, counted along +y, is not 0.
+        PhyScene tests against closed, remeshed models; here a point is inside if its winding number
+        in the original mesh, counted along +y, is not 0.
     """
     surfaces = [triangles_of(item) for item in scene.objects]
     found = np.zeros(len(surfaces), dtype=bool)

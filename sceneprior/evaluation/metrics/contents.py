@@ -42,7 +42,7 @@ def common_label_set(*groups: Sequence[Scene]) -> str:
 
 
 def class_counts(scenes: Sequence[Scene]) -> Int[np.ndarray, "scenes classes"]:
-    """Objects of each class in each scene, void left out (column 0 is 0).
+    """Number of objects of each class in each scene, void left out (column 0 is 0).
 
     Raises InputError like `common_label_set`.
     """
@@ -66,7 +66,8 @@ def category_kl(p: Float[np.ndarray, " classes"], q: Float[np.ndarray, " classes
 
         KL = sum_c p_c * (log(p_c + 1e-6) - log(q_c + 1e-6))  (Paschalidou et al., NeurIPS 2021)
 
-    Both leave void out. Training rooms in place of test rooms would give values that are too good.
+    Both leave void out. Comparing with training rooms instead of test rooms would give values that
+    are too good.
     """
     return float((p * (np.log(p + KL_EPSILON) - np.log(q + KL_EPSILON))).sum())
 

@@ -88,7 +88,7 @@ def _out_of_bounds(rooms: RoomSet, comparison: Comparison) -> Estimate:
 
 METRICS = (
     Metric(
-        "out_of_bounds_share", "Pieces out of the floor's bounds", "share; known floors alone",
+        "out_of_bounds_share", "Pieces out of the floor's bounds", "share; known floors only",
         "lower",
         _out_of_bounds,
         protocol={
@@ -107,7 +107,7 @@ METRICS = (
     ),
     Metric(
         "walkable_share_floor", "Walkable in one piece, within the floor",
-        "share; known floors alone", "higher",
+        "share; known floors only", "higher",
         mean_over_rooms(partial(walkable_share, within="floor"), 1.0),
     ),
 )  # fmt: skip

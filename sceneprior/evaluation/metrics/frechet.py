@@ -1,4 +1,4 @@
-"""Frechet distance of two sets of pictures in a network's features, and the share of gap closed."""
+"""Frechet distance between two sets of pictures in a network's features, and the gap closed."""
 
 from functools import partial
 
@@ -48,7 +48,7 @@ def frechet_distance(
     Source:
         Dowson and Landau, 1982; Heusel et al., "TTUR", NeurIPS 2017, for its use.
 
-    Example: two features that differ by 3 in one coordinate and not in spread.
+    Example: two sets whose means differ by 3 in one coordinate, with equal covariances.
 
         >>> points = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
         >>> round(frechet_distance(points, points + np.array([3.0, 0.0])), 9)

@@ -1,7 +1,7 @@
 """Accuracy of a classifier that separates a set's layouts from real ones by relations of boxes.
 
-It is 0.5 if the sets are indistinguishable, and 1 if they are always told apart. Copies of real
-rooms pass as real, so read this accuracy together with `near_copy_share`.
+It is 0.5 if the sets are indistinguishable, and 1 if every room is classified correctly. Copies of
+real rooms pass as real, so read this accuracy together with `near_copy_share`.
 """
 
 from collections.abc import Sequence
@@ -65,7 +65,7 @@ def layout_features(
         shares = shared / np.minimum(volumes[first], volumes[second])
         one, other = np.sort([object_class[first], object_class[second]], axis=0)
         for which, values, least in ((0, gaps, True), (1, shares, False), (2, apart.min(1), True)):
-            # Sorted with the wanted value last, since the last value written to a pair stays.
+            # The wanted value is sorted last, because the last value written to a pair is kept.
             order = np.argsort(-values if least else values)
             pairs[which, one[order], other[order]] = values[order]
     upper = np.triu_indices(classes)
@@ -81,7 +81,7 @@ def jittered_features(
     for scene in scenes:
         moved = scene.centers_m + rng.normal(0, JITTER_M, scene.centers_m.shape)
         resized = scene.sizes_m + rng.normal(0, JITTER_M, scene.sizes_m.shape)
-        sizes = np.maximum(resized, JITTER_M / 2)  # sizes stay positive, also of flat rugs
+        sizes = np.maximum(resized, JITTER_M / 2)  # keeps sizes positive, even of flat rugs
         classes = len(label_set(scene.label_set))
         rows.append(layout_features(moved, sizes, scene.class_indices, classes))
     return np.stack(rows)
@@ -111,7 +111,7 @@ def boosted_trees(
 def _accuracy(rooms: RoomSet, comparison: Comparison) -> Estimate:
     scenes, counts, real = rooms.scenes, rooms.counts, comparison.real
     if any(scene is other for scene in scenes[:1] for other in real):
-        # For the real training rooms, one half of the real rooms is told from the other half.
+        # To score the real training rooms, the classifier separates two halves of the real rooms.
         order = np.random.default_rng((comparison.seed, 3)).permutation(len(real))
         halves = np.array_split(order, 2)
         scenes, real = ([real[row] for row in half] for half in halves)

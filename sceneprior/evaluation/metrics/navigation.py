@@ -1,4 +1,4 @@
-"""Free floor in pixels: SceneEval's NAV, and PhyScene's R_out, R_reach and walkable area."""
+"""Free floor on a pixel map: SceneEval's NAV, and PhyScene's R_out, R_reach and walkable area."""
 
 from dataclasses import dataclass
 
@@ -11,29 +11,28 @@ from sceneprior.evaluation.metric import USED, Counts, Metric
 from sceneprior.evaluation.surfaces import footprint
 
 PIXELS = 256
-"""Width and height of the picture of the floor."""
+"""Width and height of the floor map in pixels."""
 MARGIN_M = 0.2
-"""Distance of the picture's edge from the floor's farthest corner, along an axis."""
+"""Margin between the floor's farthest corner and the edge of the map, along an axis."""
 SCENEEVAL_ROBOT_M, SCENEEVAL_HEIGHT_M = 0.2, 2.0
-"""Width of the robot, and the height of an object's centre above which it is no obstacle."""
+"""Width of the robot, and height of an object's centre above which the object is no obstacle."""
 PHYSCENE_ROBOT_M, PHYSCENE_HEIGHT_M = 0.3, 1.5
 
 
 @dataclass(frozen=True)
 class FloorMap:
-    """The picture of a room's floor, and what a robot of one width can reach in it."""
+    """Pixel map of a room's floor and objects, for a robot of one width."""
 
     floor: Bool[np.ndarray, "pixels pixels"]
     boxes: Bool[np.ndarray, "objects pixels pixels"]
-    """Each object's own box."""
+    """Pixels of each object's box."""
     grown: Bool[np.ndarray, "objects pixels pixels"]
     """The boxes with a margin of half the robot's width."""
     eroded: Bool[np.ndarray, "pixels pixels"]
     """The floor without a margin of half the robot's width along its edge."""
 
     def free(self, obstacles: Bool[np.ndarray, " objects"]) -> Int[np.ndarray, "pixels pixels"]:
-        """Numbers, from 1, of the connected areas where the middle of the robot can be, by
-        8-connectivity; 0 elsewhere."""
+        """Label the 8-connected areas where the robot's centre can be, from 1; 0 elsewhere."""
         from scipy.ndimage import label
 
         walkable = self.eroded & ~self.grown[obstacles].any(axis=0)
@@ -44,9 +43,9 @@ class FloorMap:
 def floor_map(scene: Scene, robot_m: float) -> FloorMap | None:
     """Draw a room's floor and the boxes of its objects, 256 x 256 pixels; None without a floor.
 
-    The picture is centred at the middle of the floor's bounding rectangle; its half width is the
-    largest distance of a corner along an axis, and 0.2 m. Half the robot's width is taken off the
-    floor's edge (a square), and added around each box (a line as wide as the robot).
+    The map is centred at the middle of the floor's bounding rectangle; half its width is the
+    largest distance to a corner along an axis, plus 0.2 m. The floor is eroded with a square as
+    wide as the robot, and each box grows by an outline as wide as the robot.
     """
     import cv2
 
@@ -76,7 +75,7 @@ def floor_map(scene: Scene, robot_m: float) -> FloorMap | None:
 
 
 def largest_share(areas: Int[np.ndarray, "pixels pixels"]) -> float:
-    """Pixels of the largest area as a share of those of all areas; 0 if there is none."""
+    """Share of the largest area in the pixels of all areas; 0 if there are no areas."""
     sizes = np.bincount(areas.ravel())[1:]
     return float(sizes.max() / sizes.sum()) if len(sizes) else 0.0
 
@@ -89,7 +88,7 @@ def navigability(scene: Scene) -> float | None:
 
     Source:
         3dlg-hcvc/SceneEval, metrics/navigability.py, with the default settings of its configs.
-        Corners of boxes may fall one pixel (about 3 cm) apart from those of its picture.
+        Box corners may lie one pixel (about 3 cm) from those in SceneEval's map.
     """
     found = floor_map(scene, SCENEEVAL_ROBOT_M)
     if found is None:
@@ -112,18 +111,18 @@ def reach(scene: Scene) -> Reach | None:
     """PhyScene's R_out, R_reach and walkable area, for a robot of 0.3 m; None without a floor.
 
     R_out counts objects whose box covers a pixel outside the floor. R_reach is the expected share
-    of objects next to an area of free floor, if the area is chosen in proportion to its size; an
-    object is next to it if its box, grown by half the robot's width and one pixel, touches it, and
-    all objects are obstacles, lamps on the ceiling, too. The walkable area is the largest connected
-    area of free floor as a share of all free floor, where objects whose centre is at 1.5 m or above
-    are no obstacles. Both are 0 if no floor is free.
+    of objects next to an area of free floor that is chosen with probability proportional to its
+    size. An object is next to an area if its box, grown by half the robot's width and one pixel,
+    touches the area; all objects are obstacles, even ceiling lamps. The walkable area is the
+    largest connected area of free floor as a share of all free floor, where objects whose centre is
+    at 1.5 m or above are no obstacles. R_reach and the walkable area are 0 if no floor is free.
 
     Source:
         PhyScene/PhyScene, utils/overlap.py and scripts/eval/walkable_metric.py (Yang et al.,
-        CVPR 2024). The published `cal_walkable_metric` returns inside its loop over areas, and so
-        gives the share of the first area (in the order of the picture's rows), not of the largest;
-        the largest, which its variables name, is computed here. Its variant for doors, which takes
-        the areas beside doors, is not used by the published evaluation and is left out.
+        CVPR 2024). The published `cal_walkable_metric` returns inside its loop over areas, so it
+        gives the share of the first area in row order; here, as the variable names intend, the
+        share of the largest area is computed. Its variant for areas beside doors, which the
+        published evaluation does not use, is left out.
     """
     from scipy.ndimage import binary_dilation
 
@@ -162,18 +161,18 @@ def _reach(scene: Scene) -> Counts:
 METRICS = (
     Metric(
         "sceneeval_navigability", "NAV: navigable in one piece (SceneEval)",
-        "share of free floor; known floors alone", "higher", _nav, USED,
+        "share of free floor; known floors only", "higher", _nav, USED,
     ),
     Metric(
-        "physcene_out", "R_out: objects beyond the floor (PhyScene)", "share; known floors alone",
+        "physcene_out", "R_out: objects beyond the floor (PhyScene)", "share; known floors only",
         "lower", _reach, USED,
     ),
     Metric(
-        "physcene_reach", "R_reach: objects within reach (PhyScene)", "share; known floors alone",
+        "physcene_reach", "R_reach: objects within reach (PhyScene)", "share; known floors only",
         "higher", _reach, USED,
     ),
     Metric(
         "physcene_walkable", "Walkable in one piece (PhyScene)",
-        "share of free floor; known floors alone", "higher", _reach, USED,
+        "share of free floor; known floors only", "higher", _reach, USED,
     ),
 )  # fmt: skip

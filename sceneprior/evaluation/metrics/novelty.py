@@ -14,8 +14,7 @@ from sceneprior.evaluation.layout_distance import MISSING_M, nearest_distances
 from sceneprior.evaluation.metric import GENERATED, Comparison, Metric, RoomSet, TableColumn
 
 NEAR_COPY_QUANTILE = 0.01
-"""Share of real training rooms that count as near copies of another one, which sets the
-threshold."""
+"""Share of real training rooms that count as near copies of another; it sets the threshold."""
 THRESHOLD_ROOMS = 500
 """Largest number of training rooms for measuring the threshold; thousands would take minutes."""
 
@@ -23,9 +22,9 @@ THRESHOLD_ROOMS = 500
 def near_copy_threshold(training: Sequence[Scene]) -> float:
     """The distance in metres below which a room is a near copy of a training room.
 
-    It is the 1% quantile of the distances of training rooms to the nearest other one with the same
-    furniture, up to one object more or fewer; infinite distances count. If the quantile is infinite
-    (hardly any two rooms share their furniture), it is 0, and no room is a near copy.
+    It is the 1% quantile of the distances of training rooms to the nearest other training room with
+    the same furniture, up to one object more or fewer; infinite distances count. If the quantile is
+    infinite (hardly any two rooms share their furniture), it is 0, and no room is a near copy.
     """
     rows = np.linspace(0, len(training) - 1, min(len(training), THRESHOLD_ROOMS)).astype(int)
     rooms = [training[row] for row in rows]

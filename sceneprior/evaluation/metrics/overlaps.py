@@ -13,8 +13,8 @@ from sceneprior.evaluation.metric import Comparison, Metric, RoomSet, TableColum
 from sceneprior.evaluation.metrics.contents import class_counts
 
 OVERLAP_SHARE = 0.01
-"""Two boxes intersect if they share more than this part of the smaller one's volume, so that
-objects that touch, or overlap by a few millimetres, do not count."""
+"""Share of the smaller box's volume above which two boxes intersect; objects that touch, or overlap
+by a few millimetres, stay below it."""
 DEEP_M = 0.01
 """Penetration depth, in metres, above which two boxes count as a deep pair."""
 PLAUSIBLE_SHARE = 0.05
@@ -43,8 +43,8 @@ class RoomOverlaps(NamedTuple):
 def room_overlaps(scene: Scene) -> RoomOverlaps:
     """Compare every pair of objects of a room by their axis-aligned boxes, void objects left out.
 
-    A box is larger than its object (a chair pushed under a table, an object at an angle), so real
-    rooms have intersections, too: compare a result with the number in real rooms.
+    A box is larger than its object (a chair pushed under a table, a rotated object), so boxes also
+    intersect in real rooms: compare results with the number in real rooms.
     """
     known = scene.class_indices != VOID
     classes = scene.class_indices[known]

@@ -115,7 +115,7 @@ class PairDistances:
 
 
 def pair_distances(rooms: RoomSet, comparison: Comparison) -> PairDistances:
-    """Distance of the gaps of every common pair; a pair that the set lacks has gap `FAR_M`."""
+    """Compute `PairDistances`; a set without a pair is treated as having one gap of `FAR_M`."""
     mine, theirs = nearest_gaps(rooms.scenes), nearest_gaps(comparison.test.scenes)
     pairs = [pair for pair in common_pairs(comparison.real) if pair in theirs]
     absent = Gaps(np.array([FAR_M]), np.array([0]))

@@ -60,7 +60,7 @@ def settle(scene: Scene, seconds: float = SECONDS) -> Settled:
 
 
 def stable_count(scene: Scene) -> Counts:
-    """The metric of use `stable_share`: stable objects, and all objects, of a scene."""
+    """Numbers of stable objects and of all objects of a scene, for `stable_share`."""
     stable = settle(scene).stable if scene.objects else np.zeros(0)
     return {"stable_share": (float(stable.sum()), float(len(stable)))}
 

@@ -1,4 +1,4 @@
-"""Objects that rest on something: SceneEval's SUPPORT, with a table of classes."""
+"""SceneEval's SUPPORT: objects that rest on the floor, a wall, the ceiling or another object."""
 
 import numpy as np
 import shapely
@@ -20,37 +20,37 @@ from sceneprior.evaluation.surfaces import (
 )
 
 NEAR_M = 0.01
-"""Length of the rays, and height of the layer of vertices in which they start."""
+"""Length of the rays, and thickness of the object's outermost layer, in which they start."""
 LIFT_M = 0.005
 """Distance by which an object is moved against gravity before rays are cast."""
 FACING = 0.9
-"""Smallest cosine between gravity and the normals of faces on which rays start."""
+"""Minimum cosine between gravity and the normals of faces on which rays start."""
 PER_M2, FEWEST, MOST = 256, 32, 100_000
-"""Rays per square metre of the largest such face, per face at least, and per object at most."""
+"""Rays per square metre of the largest such face, minimum per face, maximum per object."""
 HIGH_M = 100.0
-"""Height of walls whose ceiling is not known."""
+"""Height of walls if the ceiling is unknown."""
 
 
 def supported(scene: Scene) -> Float[np.ndarray, " objects"]:
-    """1 for supported objects, 0 for others, and NaN where the scene cannot tell: SceneEval's
-    SUPPORT.
+    """1 for supported objects, 0 for others, and NaN if unknown: SceneEval's SUPPORT.
 
-    The object is moved by 5 mm against its gravity (down, up for the ceiling, backwards for walls).
-    Rays of 1 cm are cast along gravity from its vertices within 1 cm of its outermost one, and from
-    `max(32, 256 * area of the largest face in m2)` points of each face among them that faces
-    gravity. A contact is the nearest point of the floor, a wall, the ceiling, or another object on
-    a ray. Objects on the ceiling and on walls need one contact. All others need four, and their
+    Each object has a direction of gravity: up for objects on the ceiling, backwards for objects on
+    walls, down for all others. The object is moved by 5 mm against gravity. Rays of 1 cm are cast
+    along gravity from the vertices within 1 cm of the outermost vertex, and from `max(32, 256 *
+    area of the largest face in m2)` points on each face that consists of such vertices and faces
+    gravity. A contact is the point where a ray hits the floor, a wall, the ceiling, or another
+    object. Objects on the ceiling and on walls need one contact. All others need four, and their
     centroid (mean of triangles by area) above the convex hull of the contacts.
 
-    A ceiling or wall that the scene does not know leaves pieces that need it out (NaN). Without a
+    Objects on a wall or ceiling are NaN if the scene does not know that wall or ceiling. Without a
     floor outline, the rectangle around all furniture is the floor.
 
     Source:
         3dlg-hcvc/SceneEval, metrics/support.py; the largest number of rays from nepfaff/SceneEval.
-        There a vision-language model says what an object rests on, and here its class
-        (`support_of`). There the floor is at the lowest point of all objects, and here at height 0.
-        A piece for walls whose yaw is unknown is tested in four directions, and as an object on
-        the ground, too, such as a television on its stand.
+        There, a vision-language model decides what an object rests on; here, its class does
+        (`support_of`). There, the floor is at the lowest point of all objects; here, at height 0. A
+        wall object with unknown yaw is tested in four directions, and also as a standing object,
+        such as a television on its stand.
     """
     surfaces = [triangles_of(item) for item in scene.objects]
     rooms = _planes(scene)
@@ -93,8 +93,7 @@ def _stands(surface: Triangles, others: Triangles, seed: int) -> bool:
 def _contacts(
     surface: Triangles, others: Triangles, gravity: Float[np.ndarray, "3"], seed: int
 ) -> Points:
-    """Nearest points of other surfaces on the rays of an object, in a frame in which gravity is
-    -y."""
+    """Points where an object's rays hit other surfaces, in a frame in which gravity is -y."""
     turn = _downwards(gravity)
     surface = surface @ turn.T + np.array([0.0, LIFT_M, 0.0])
     starts = _ray_starts(surface, seed)

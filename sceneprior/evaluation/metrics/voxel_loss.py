@@ -1,4 +1,4 @@
-"""Volume out of the room, and shared by objects, in voxels: ReSpace's OOB, MBL and PBL."""
+"""ReSpace's OOB, MBL and PBL: volumes outside the room and shared by objects, in voxels."""
 
 from typing import NamedTuple
 
@@ -21,9 +21,9 @@ from sceneprior.evaluation.surfaces import (
 
 PITCH_M = 0.05
 VALID_M3 = 0.1
-"""Largest PBL of a valid room."""
+"""Largest PBL of a valid room, in cubic metres."""
 LEAST = 1e-7
-"""Areas and volumes below this are 0."""
+"""Areas and volumes below this value count as 0."""
 
 
 class VoxelLoss(NamedTuple):
@@ -34,32 +34,31 @@ class VoxelLoss(NamedTuple):
 
     @property
     def pbl_m3(self) -> float:
-        """The sum of both."""
+        """PBL: the sum of OOB and MBL."""
         return self.oob_m3 + self.mbl_m3
 
 
 def voxel_loss(scene: Scene) -> VoxelLoss | None:
-    """Volume of objects outside the room (OOB), and shared by pairs of objects (MBL, mesh-based
-    loss), whose sum is ReSpace's PBL (VBL in its paper); None without a floor.
+    """ReSpace's OOB (volume of objects outside the room) and MBL (volume shared by pairs of
+    objects, mesh-based loss). Their sum is PBL (VBL in the paper). None without a floor.
 
-    Volumes are counted in voxels of 5 cm: all that a surface passes through, and those enclosed.
-    An object is voxelized around the middle of its lower face, which is then put at a whole number
-    of voxels, rounded down in plan, and to the nearest one in height. The room is the prism over
-    its floor. Voxels are counted only for objects whose box leaves the room, and for pairs whose
-    boxes share volume.
+    An object's voxels of 5 cm are those that its surface passes through or encloses. An object is
+    voxelized around the centre of its lower face, which is then moved to a whole voxel: rounded
+    down in x and z, and to the nearest in y. The room is the prism over its floor. Voxels are
+    counted only for objects whose box leaves the room, and for pairs whose boxes share volume.
 
-    A box leaves the room if it does so by more than 1 mm (`FLUSH_M`), since the grid would count a
-    whole layer of a wardrobe that is flush with a wall.
+    A box leaves the room if it does so by more than 1 mm (`FLUSH_M`), since otherwise a wardrobe
+    flush with a wall could lose a whole layer of voxels to the outside.
 
     Since surfaces fill the voxels that they touch, an object counts as up to one voxel larger, and
     objects that overlap by a millimetre may share a layer of voxels.
 
     Source:
-        GradientSpaces/respace, src/eval.py, read in a copy of the file, since the repository's own
-        is not in the index that was searched (Bucher and Armeni, arXiv 2506.02459). There a room
-        is the voxelized mesh of its outline; here a voxel is in the room if the outline meets it.
-        There heights are rounded down, too, so that a bed 1 mm below the floor loses a layer.
-        The height is the ceiling's, or, if that is not known, as in `ceiling_height`.
+        GradientSpaces/respace, src/eval.py, read in a third-party copy of the file (Bucher and
+        Armeni, arXiv 2506.02459). There, a room is the voxelized mesh of its outline; here, a voxel
+        is in the room if it touches the outline's area. There, heights are also rounded down, so
+        that a bed 1 mm below the floor loses a layer. The room's height is the ceiling's, or, if
+        that is unknown, `ceiling_height`.
     """
     floor = floor_polygon(scene)
     if floor is None:
@@ -93,7 +92,7 @@ def _area(a: shapely.Geometry, b: shapely.Geometry) -> float:
 
 
 def _span(item: SceneObject) -> tuple[float, float]:
-    """Heights of the lowest and the highest point of an object's surface."""
+    """Heights of the lowest and highest points of an object's surface."""
     low, high = bounds(triangles_of(item))[:, 1].tolist()
     return low, high
 
@@ -148,7 +147,7 @@ def _respace(scene: Scene) -> Counts:
 
 METRICS = (
     *(
-        Metric(key, title, "mean, litres; known floors alone", "lower", _respace, USED)
+        Metric(key, title, "mean, litres; known floors only", "lower", _respace, USED)
         for key, title in (
             ("respace_oob_litres", "OOB: volume out of the room (ReSpace)"),
             ("respace_mbl_litres", "MBL: volume shared by objects (ReSpace)"),
@@ -157,6 +156,6 @@ METRICS = (
     ),
     Metric(
         "respace_valid", "Rooms with a PBL of at most 100 litres (ReSpace)",
-        "share; known floors alone", "higher", _respace, USED,
+        "share; known floors only", "higher", _respace, USED,
     ),
 )  # fmt: skip

@@ -109,10 +109,13 @@ def refuse(number: int):
 @pytest.mark.parametrize(
     ("number", "advice"),
     [
-        (errno.ENOSPC, "(No space left on device); make room on its disk, or name another place."),
-        (errno.EROFS, "(Read-only file system); name a place that can be written."),
-        (errno.EACCES, "(Permission denied); name another place, or have its permissions"),
-        (errno.EDQUOT, "(Disk quota exceeded); make room in your quota"),
+        (
+            errno.ENOSPC,
+            "(No space left on device); free space on its disk, or name another folder.",
+        ),
+        (errno.EROFS, "(Read-only file system); name a folder that can be written."),
+        (errno.EACCES, "(Permission denied); change its permissions, or name another"),
+        (errno.EDQUOT, "(Disk quota exceeded); free space in your quota"),
         (errno.EMFILE, "(Too many open files); allow more open files with `ulimit -n 4096`."),
     ],
 )
@@ -139,7 +142,7 @@ def test_what_a_command_could_not_write_is_named(command, toy_run, monkeypatch, 
     monkeypatch.setattr("data_prep.homes.make._write_split", refuse(errno.ENOSPC))
     run = {"make-homes": [], "pack": [toy_run]}.get(name, ["--run", toy_run])
     said = one_sentence(command(name, *run, *more, "target"))
-    assert "target cannot be read or written (No space left on device); make room" in said
+    assert "target cannot be read or written (No space left on device); free space" in said
     assert not list(Path().iterdir())
 
 
@@ -178,5 +181,7 @@ def on_full(command, *words) -> str:
     status, _, errors = command(*words)
     last = errors.strip().splitlines()[-1]  # progress bars may stand before it
     assert status == 2 and "Traceback" not in errors, errors
-    assert last.endswith("(No space left on device); make room on its disk, or name another place.")
+    assert last.endswith(
+        "(No space left on device); free space on its disk, or name another folder."
+    )
     return last

@@ -31,7 +31,7 @@ def test_scores_of_a_packed_prior_need_a_file_and_shards(
     command, packed, toy_shards, tmp_path, monkeypatch, few_attempts
 ):
     without_classifiers(monkeypatch)
-    assert "mine.prior is not a folder that scores.json could go to" in one_sentence(
+    assert "mine.prior is not a folder, so scores.json cannot go there" in one_sentence(
         command("eval-fid", "--run", "mine.prior", "-n", 3)
     )
     call = ["eval-fid", "--run", "procthor-bedroom", "-n", 3, "--out", "s.json"]

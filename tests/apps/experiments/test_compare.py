@@ -266,7 +266,7 @@ def test_a_stopped_comparison_says_how_it_goes_on(command, written, calls, tmp_p
 
     calls.before = stop
     status, _, errors = command("compare", "--config", written(), "--out", tmp_path / "out")
-    assert status == 130 and errors.endswith("Stopped. The same command goes on from here.\n")
+    assert status == 130 and errors.endswith("Stopped. Run the same command again to continue.\n")
     assert not (tmp_path / "out" / "table.md").exists()
 
 

@@ -53,7 +53,10 @@ def test_methods_are_trained_scored_and_tabulated(toy_shards, tmp_path, monkeypa
     assert done.exit_code == 0, done.output
     table = (out / "table.md").read_text()
     assert "4 views of 2 test rooms of shards" in table and "Toys" in table
-    assert "of the objects have a CAD model that training rooms hold, too; masks, classes" in table
+    assert (
+        "of the objects have a CAD model that also occurs in training rooms; masks, classes"
+        in table
+    )
     assert "boxes are upright and along the room's axes" in table
     lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()
              if line.startswith("|")]  # fmt: skip

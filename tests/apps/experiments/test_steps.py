@@ -119,7 +119,7 @@ def test_a_command_that_failed_is_told_by_its_own_sentence(tmp_path):
     assert failure_reason(log, 1) == "ValueError: odd."
     log.write_text("\n 73%\n")
     assert failure_reason(log, 1) == "73%"
-    assert failure_reason(log, -9) == "killed by SIGKILL; the same command goes on"
+    assert failure_reason(log, -9) == "killed by SIGKILL; run the same command again to continue"
     log.write_text("")
     assert failure_reason(log, 1) == f"it printed nothing to {log}"
     assert failure_reason(None, 3) == "exit status 3"

@@ -242,7 +242,7 @@ def test_numbers_that_are_none_and_classes_that_are_not_there(sampler_file, tmp_
     name = "sampler.look_class"
     broken = tensors | {name: torch.full_like(tensors[name], 99)}
     path = rewritten(sampler_file, tmp_path / "b.prior", weights=save(broken))
-    assert f"{name} names classes that are not there" in refused(path)
+    assert f"{name} holds class indices out of range" in refused(path)
     del tensors[name]
     path = rewritten(sampler_file, tmp_path / "c.prior", weights=save(tensors))
     assert "sampler.look_class and 0 others do not fit" in refused(path)

@@ -270,7 +270,7 @@ def test_coco_says_the_same_as_a_png_and_its_table(own, seen, tmp_path):
     (image,) = read_own_image(coco, None, INTRINSICS, LABELS, pose).images
     np.testing.assert_array_equal(image.instance_ids, seen.instance_ids)
     np.testing.assert_array_equal(image.object_class, seen.object_class)
-    with pytest.raises(InputError, match="has its classes in itself; leave out --classes"):
+    with pytest.raises(InputError, match="already lists its classes; leave out --classes"):
         read_own_image(coco, classes, INTRINSICS, LABELS, pose)
     with pytest.raises(InputError, match=r"mask\.png needs --classes: a table of the class"):
         read_own_image(mask, None, INTRINSICS, LABELS, pose)

@@ -43,7 +43,7 @@ def test_other_texts_of_the_panel_are_escaped_too():
     room = Scene(NAME, "front3d_bedroom", extra={"wishes": wishes})
     for text in (CLASS, error_words(CLASS), wish_words(room)):
         assert CLASS not in html(text) and "&lt;img" in html(text)
-    assert html(wish_words(room)).count("does not hold") == 1
+    assert html(wish_words(room)).count("not fulfilled") == 1
     for other in (None, {}, CLASS, [], 3):
         assert not wish_words(Scene(NAME, "front3d_bedroom", extra={"wishes": other}))
 
@@ -71,7 +71,7 @@ def test_a_request_is_answered_or_refused_in_the_panel(prior):
         page = Page(server, Explorer(prior), "prior", asked=asked)
         panel, fields = page.panel, page.panel._fields
         assert fields.floor.value == "0,0 4,0 4,3 0,3"
-        assert "The request of the command has more: want." in fields._rest_said.content
+        assert "The command also requests: want." in fields._rest_said.content
         assert "✓ 2 nightstand" in panel._answer.content
         fields.want.value, fields.openings.value = "double_bed: 1", "door@south"
         panel._sample(page.explorer, 1, None)

@@ -52,7 +52,7 @@ def test_what_it_cannot_do_is_a_sentence(baseline_run, toy_shards, method):
 @pytest.mark.parametrize("method", METHODS)
 def test_settings_without_effect_are_refused(toy_shards, method):
     settings = tiny_baseline_settings(toy_shards, method)
-    with pytest.raises(ConfigError, match="turned copies are all the same to it; set it to false"):
+    with pytest.raises(ConfigError, match="turned copies would all be the same; set it to false"):
         check_config(settings | {"data": settings["data"] | {"augment_rotations": True}}, "a")
 
 

@@ -31,7 +31,7 @@ def test_a_folder_that_cannot_be_written(front, tmp_path):
     ("number", "said"),
     [
         (errno.ENOSPC, r"cannot be written \(No space left on device\)\. Finished shards are kept: "
-         "make room on the disk and run the same command again"),
+         "free space on the disk and run the same command again"),
         (errno.EROFS, r"\(Read-only file system\)\. Finished shards are kept: run the same"),
     ],
     ids=["full", "read-only"],

@@ -157,7 +157,7 @@ MISTAKES = {
     "ids that restart in every image": Mistake(
         of_ids(_restart), r"the ids of the masks are not those of objects .*: pass --tracks auto"
     ),
-    "one frame a room": Mistake(_one_frame, r"there is one frame a room, .* give at least two"),
+    "one frame a room": Mistake(_one_frame, r"there is only one frame per room.* at least two"),
 }  # fmt: skip
 QUICK = ("OpenCV's axes", "inverted", "mirrored", "shuffled", "focal length 1.3",
          "ids that restart in every image")  # fmt: skip
@@ -208,7 +208,8 @@ def test_right_captures_pass_and_what_was_checked_is_said(captures, tmp_path):
     found = verify(shards_of(captures, tmp_path / "shards"))
     assert found.problems == ()
     assert re.search(
-        r"^all is well\. .*masks fit the cameras by 0\.[78]\d of 1 \(shuffled cameras: 0\.[123]\d\)"
-        r", which excludes matrices of another kind or with other axes, poses of other frames",
+        r"^all is well\. .*masks and cameras agree by 0\.[78]\d of 1 "
+        r"\(shuffled cameras: 0\.[123]\d\), which excludes matrices of another kind or "
+        r"with other axes, poses of other frames",
         summary(found),
     )

@@ -137,8 +137,8 @@ def test_assumptions_are_said_before_the_work(source, rooms):
         "2 of 4 rooms give no metres_per_unit: poses are assumed to be in metres,"
     )
     assert said[2] == (
-        "In 4 of 4 rooms the tops of the pictures point along z, but y is taken as up: is it "
-        "--up z?"
+        "In 4 of 4 rooms the tops of the pictures point along z, but y is taken as up; should "
+        "it be --up z?"
     )
     told = PosedSettings(floor_m=0.0, metres_per_unit=0.5)
     assert PosedSource(source.folder, SET, told).assumptions() == []

@@ -235,7 +235,7 @@ def test_all_frames_of_a_room_have_one_size(room):
     ("settings", "said"),
     [
         ({"up": "x"}, "up is 'x'; choose from auto, z, y, cameras."),
-        ({"max_side": 0}, "max_side is 0; it counts from 1."),
+        ({"max_side": 0}, "max_side is 0; expected at least 1."),
         ({"camera_height_m": 0.0}, "camera_height_m is 0.0; it must be above 0."),
         ({"metres_per_unit": float("inf")}, "metres_per_unit is inf; it must be above 0."),
         ({"floor_m": float("nan")}, "floor_m is nan; expected a height in metres."),

@@ -38,7 +38,7 @@ def test_unknown_names_and_foreign_folders_are_refused(tmp_path):
 def test_settings_are_checked(folder):
     reader = open_reader("structured3d", folder)
     for name in ("max_side", "max_views"):
-        with pytest.raises(InputError, match=f"{name} is 0; it counts from 1"):
+        with pytest.raises(InputError, match=f"{name} is 0; expected at least 1"):
             PublicSource(reader, **{name: 0}).settings(None)
     with pytest.raises(InputError, match=r"has no scene 'scene_9' \(--only takes a scene"):
         PublicSource(reader, only="scene_9").settings("scene_9")

@@ -103,7 +103,7 @@ def scan_mask(scan, frame):
         (".sens", r"\.sens cannot be opened"),
         (".txt", r"\.txt cannot be read .No such file"),
         (".aggregation.json", "a scan without annotations"),
-        ("_vh_clean_2.0.010000.segs.json", r"segs\.json cannot be read .* which object"),
+        ("_vh_clean_2.0.010000.segs.json", r"segs\.json cannot be read .* to objects"),
         ("_vh_clean_2.ply", r"_vh_clean_2\.ply cannot be read"),
         ("_2d-instance-filt.zip", r"_2d-instance-filt\.zip is missing: .* folder\.$"),
     ],
@@ -152,7 +152,7 @@ def test_masks_of_another_shape_than_the_colour_frames(scan, labels):
     ("change", "words"),
     [
         ({"masks": "best"}, "masks is 'best'; choose filt or raw"),
-        ({"frame_step": 0}, "frame_step is 0; it counts from 1"),
+        ({"frame_step": 0}, "frame_step is 0; expected at least 1"),
     ],
 )
 def test_settings_that_mean_nothing(change, words):
