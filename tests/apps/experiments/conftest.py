@@ -6,8 +6,10 @@ from pathlib import Path
 import pytest
 from toy_metrics import without_classifiers
 
+from sceneprior.apps.experiments import evaluate
 from sceneprior.apps.rooms import write_scenes
 from sceneprior.core.ground_truth import reference_scenes
+from sceneprior.evaluation import report
 
 
 @pytest.fixture(scope="session")
@@ -24,3 +26,13 @@ def scenes(toy_shards, tmp_path_factory) -> Path:
 def no_classifier(monkeypatch: pytest.MonkeyPatch) -> None:
     """Evaluations in this process answer without classifiers, which take most of their time."""
     without_classifiers(monkeypatch)
+
+
+@pytest.fixture(autouse=True)
+def few_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Report pages show two rooms of each kind and one curve: pictures take most of their time."""
+    for module in (report, evaluate):
+        monkeypatch.setattr(module, "ROOMS_SHOWN", 2)
+    monkeypatch.setattr(report, "DECODED_SHOWN", 2)
+    monkeypatch.setattr(evaluate, "UNFOLDING_STEPS", 2)
+    monkeypatch.setattr(evaluate, "CURVES", ("loss",))
