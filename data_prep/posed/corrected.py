@@ -1,0 +1,144 @@
+"""Corrects the poses of a room that its masks contradict, and finds the masks that are wrong."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
+
+from data_prep.posed.tangents import Gaps, Outlines, find_outlines, measure_gaps
+from sceneprior.core.shards import Sightings
+
+WRONG_PX, LESS = 0.3, 0.5
+"""Poses are corrected if the median gap exceeds `WRONG_PX`, and the correction brings it below the
+share `LESS` of what it was. Exact masks and poses have 0.11 to 0.18 px."""
+TURN_RAD, MOVE_M = np.radians(1.0), 0.02
+"""Assumed standard deviations of the errors of a pose; they keep poses that the masks do not
+determine where they are."""
+_SCALE_PX = 1.0
+"""Gap from which a measurement loses its weight; where the median is larger, the median."""
+_ROUNDS = 10
+_TOO_WIDE, _TOO_WIDE_PX = 0.1, 3.0
+"""A mask is too wide for another one if it exceeds that one's range of planes by this share, and by
+this many pixels."""
+_MOST_AGREE, _LEAST_PAIRS = 0.5, 2
+"""A mask is wrong if it is too wide for more than this share of the object's other masks, of which
+at least so many can be compared."""
+_DIGITS = 6
+"""Decimals of a correction, in radians and metres, so that last bits of sums do not matter."""
+
+
+class Corrected(NamedTuple):
+    """Poses that agree with the masks of a room, and the masks that agree with no poses."""
+
+    world_to_camera: Float[np.ndarray, "views 4 4"]
+    wrong: Bool[np.ndarray, "views objects"]
+    """Masks that show more than their object, such as two objects that are merged."""
+    notes: list[str]
+
+
+def correct(
+    seen: Sightings,
+    world_to_camera: Float[np.ndarray, "views 4 4"],
+    intrinsics: Float[np.ndarray, "views 3 3"],
+) -> Corrected:
+    """Compare the masks of each object in all pairs of views, and correct what they contradict.
+
+    Poses stay as they are, bit for bit, if they agree with the masks, or if no small correction
+    makes them agree. The room as a whole keeps its place.
+    """
+    outlines = find_outlines(seen, intrinsics)
+    poses = world_to_camera.astype(np.float64)
+    change, notes = _adjusted(outlines, poses), []
+    before, after = (_median_px(_gaps(outlines, poses, each)) for each in (0 * change, change))
+    if before > WRONG_PX and after < LESS * before:
+        world_to_camera = moved_cameras(poses, change)
+        degrees = np.degrees(np.median(np.linalg.norm(change[:, :3], axis=1)))
+        centimetres = 100 * np.median(np.linalg.norm(change[:, 3:], axis=1))
+        notes.append(
+            f"poses are corrected by {degrees:.2f} degrees and {centimetres:.1f} cm (medians): "
+            f"outlines of different views now agree to {after:.1f} pixels, before to {before:.1f}"
+        )
+    else:
+        change = 0 * change
+    wrong = np.zeros(seen.visible.shape, dtype=bool)
+    masks = wrong_masks(outlines, _gaps(outlines, poses, change))
+    wrong[outlines.view[masks], outlines.item[masks]] = True
+    if wrong.any():
+        notes.append(f"{wrong.sum()} masks show more than their object, so say other views: void")
+    return Corrected(world_to_camera, wrong, notes)
+
+
+def moved_cameras(
+    world_to_camera: Float[np.ndarray, "views 4 4"], change: Float[np.ndarray, "views 6"]
+) -> Float[np.ndarray, "views 4 4"]:
+    """Turn each camera about its centre by a rotation vector, then move it, along world axes."""
+    rotations, centers_m = _changed(world_to_camera, change)
+    moved = np.tile(np.eye(4), (len(change), 1, 1))
+    moved[:, :3, :3] = rotations
+    moved[:, :3, 3] = -np.einsum("vij,vj->vi", rotations, centers_m)
+    return moved
+
+
+def _changed(poses: np.ndarray, change: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations and centres of cameras after a change."""
+    turns = Rotation.from_rotvec(change[:, :3]).as_matrix()
+    centers_m = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
+    return poses[:, :3, :3] @ turns.transpose(0, 2, 1), centers_m + change[:, 3:]
+
+
+def _gaps(outlines: Outlines, poses: np.ndarray, change: np.ndarray) -> Gaps:
+    return measure_gaps(outlines, *_changed(poses, change))
+
+
+def _used(gaps: Gaps) -> Bool[np.ndarray, "pairs 2"]:
+    return gaps.valid[:, None] & gaps.clear.all(axis=2)
+
+
+def _median_px(gaps: Gaps) -> float:
+    sizes = np.abs(gaps.gaps_px[_used(gaps)])
+    return float(np.median(sizes)) if len(sizes) else 0.0
+
+
+def _adjusted(outlines: Outlines, poses: np.ndarray) -> Float[np.ndarray, "views 6"]:
+    """Turns and moves of all cameras that minimise the gaps, by Gauss-Newton steps.
+
+    Gaps are weighted as by Geman and McClure: one that is much larger than the others, as at an
+    end that is hidden unnoticed, has almost no weight.
+    """
+    views = len(poses)
+    change = np.zeros((views, 6))
+    held = np.diag(np.repeat([TURN_RAD, MOVE_M], 3) ** -2.0)
+    cameras = outlines.view[outlines.pairs]
+    for _ in range(_ROUNDS):
+        gaps = _gaps(outlines, poses, change)
+        scale = max(_SCALE_PX, _median_px(gaps))
+        weights = np.where(_used(gaps), (1 + (gaps.gaps_px / scale) ** 2) ** -2, 0.0)
+        slopes = gaps.slopes.reshape(*gaps.gaps_px.shape, 2, 6)
+        square = np.zeros((views, views, 6, 6))
+        pull = -change @ held
+        for i in range(2):
+            one = slopes[:, :, i] * weights[..., None]
+            np.subtract.at(pull, cameras[:, i], np.einsum("pe,pei->pi", gaps.gaps_px, one))
+            for j in range(2):
+                both = np.einsum("pei,pej->pij", one, slopes[:, :, j])
+                np.add.at(square, (cameras[:, i], cameras[:, j]), both)
+        square[np.arange(views), np.arange(views)] += held
+        matrix = square.transpose(0, 2, 1, 3).reshape(6 * views, 6 * views)
+        change = change + np.linalg.solve(matrix, pull.ravel()).reshape(views, 6)
+    return change.round(_DIGITS)
+
+
+def wrong_masks(outlines: Outlines, gaps: Gaps) -> Bool[np.ndarray, " masks"]:
+    """True for masks that are too wide for most of the object's masks in other views.
+
+    A mask that is too narrow may be hidden in part; one that is too wide shows something else.
+    """
+    told, against = np.zeros((2, len(outlines.view)), dtype=np.int64)
+    for mine, other, wider_px in ((0, 1, -gaps.gaps_px), (1, 0, gaps.gaps_px)):
+        limit_px = np.maximum(_TOO_WIDE_PX, _TOO_WIDE * gaps.widths_px[:, other])
+        known = gaps.clear[:, :, other] & gaps.valid[:, None]
+        too_wide = (known & (wider_px > limit_px[:, None])).any(axis=1)
+        np.add.at(told, outlines.pairs[:, mine], known.any(axis=1))
+        np.add.at(against, outlines.pairs[:, mine], too_wide)
+    return (told >= _LEAST_PAIRS) & (against > _MOST_AGREE * told)
