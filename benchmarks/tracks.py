@@ -17,6 +17,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 
+from data_prep.posed.corrected import correct
 from data_prep.tracks.associate import FrameMasks, associate
 from sceneprior.core.instances.observations import observe
 from sceneprior.core.overlaps import box_iou_3d
@@ -189,10 +190,14 @@ def rand_index(a: np.ndarray, b: np.ndarray) -> float:
 def _boxes(
     views: RoomViews, ids: np.ndarray, classes: np.ndarray, poses: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Centres and sizes of the boxes lifted from images of object ids."""
+    """Centres and sizes of the boxes lifted from images of object ids, after the corrections of
+    `prep-posed`."""
     void = len(classes) + 1
     seen = observe(np.where(ids < 0, void, ids).astype(np.uint32), [*classes.tolist(), 0])
-    boxes = lift_boxes(seen.room_views(views.room_id, poses, views.intrinsics))
+    found = correct(seen, poses, views.intrinsics)
+    if found.world_to_camera is not None:
+        poses = found.world_to_camera
+    boxes = lift_boxes(found.seen.room_views(views.room_id, poses, views.intrinsics))
     return boxes.centers_m, boxes.sizes_m
 
 

@@ -7,11 +7,13 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from data_prep.posed.tangents import Gaps, Outlines, find_outlines, measure_gaps
-from sceneprior.core.shards import Sightings
+from sceneprior.core.classes import VOID
+from sceneprior.core.instances.observations import Observations, observe
 
-WRONG_PX, LESS = 0.3, 0.5
-"""Poses are corrected if the median gap exceeds `WRONG_PX`, and the correction brings it below the
-share `LESS` of what it was. Exact masks and poses have 0.11 to 0.18 px."""
+LESS = 0.9
+"""Poses are corrected if a correction that is fitted to one half of the objects makes the median
+gap of the other half smaller than this share of what it was. Where poses are exact, it is at least
+0.99 of it, also with ragged masks."""
 TURN_RAD, MOVE_M = np.radians(1.0), 0.02
 """Assumed standard deviations of the errors of a pose; they keep poses that the masks do not
 determine where they are."""
@@ -21,6 +23,8 @@ _ROUNDS = 10
 _TOO_WIDE, _TOO_WIDE_PX = 0.1, 3.0
 """A mask is too wide for another one if it exceeds that one's range of planes by this share, and by
 this many pixels."""
+_FIT_PX = 1.5
+"""Median gap up to which poses fit well enough to tell which masks are wrong."""
 _MOST_AGREE, _LEAST_PAIRS = 0.5, 2
 """A mask is wrong if it is too wide for more than this share of the object's other masks, of which
 at least so many can be compared."""
@@ -29,44 +33,69 @@ _DIGITS = 6
 
 
 class Corrected(NamedTuple):
-    """Poses that agree with the masks of a room, and the masks that agree with no poses."""
+    """Views of a room whose masks agree better."""
 
-    world_to_camera: Float[np.ndarray, "views 4 4"]
-    wrong: Bool[np.ndarray, "views objects"]
-    """Masks that show more than their object, such as two objects that are merged."""
+    world_to_camera: Float[np.ndarray, "views 4 4"] | None
+    """None if the poses stay as they are."""
+    seen: Observations
+    """Masks that show more than their object, such as two objects that are merged, are void."""
     notes: list[str]
 
 
 def correct(
-    seen: Sightings,
+    seen: Observations,
     world_to_camera: Float[np.ndarray, "views 4 4"],
     intrinsics: Float[np.ndarray, "views 3 3"],
 ) -> Corrected:
     """Compare the masks of each object in all pairs of views, and correct what they contradict.
 
-    Poses stay as they are, bit for bit, if they agree with the masks, or if no small correction
-    makes them agree. The room as a whole keeps its place.
+    Poses stay as they are if they agree with the masks, or if no small correction makes them agree.
+    The room as a whole keeps its place. If no mask is wrong, `seen` is returned itself.
     """
-    outlines = find_outlines(seen, intrinsics)
-    poses = world_to_camera.astype(np.float64)
-    change, notes = _adjusted(outlines, poses), []
-    before, after = (_median_px(_gaps(outlines, poses, each)) for each in (0 * change, change))
-    if before > WRONG_PX and after < LESS * before:
-        world_to_camera = moved_cameras(poses, change)
-        degrees = np.degrees(np.median(np.linalg.norm(change[:, :3], axis=1)))
-        centimetres = 100 * np.median(np.linalg.norm(change[:, 3:], axis=1))
+    outlines, notes = find_outlines(seen, intrinsics), []
+    poses, as_given = world_to_camera.astype(np.float64), np.zeros((len(world_to_camera), 6))
+    gaps, moved = _gaps(outlines, poses, as_given), None
+    if _poses_err(outlines, poses):
+        change = _adjusted(outlines, poses)
+        moved, corrected = moved_cameras(poses, change), _gaps(outlines, poses, change)
+        turned, shifted = (np.median(np.linalg.norm(part, axis=1)) for part in np.hsplit(change, 2))
         notes.append(
-            f"poses are corrected by {degrees:.2f} degrees and {centimetres:.1f} cm (medians): "
-            f"outlines of different views now agree to {after:.1f} pixels, before to {before:.1f}"
+            f"poses are corrected by {np.degrees(turned):.2f} degrees and {100 * shifted:.1f} cm "
+            f"(medians): outlines now agree to {_median_px(corrected):.2f} pixels, before to "
+            f"{_median_px(gaps):.2f}"
         )
-    else:
-        change = 0 * change
-    wrong = np.zeros(seen.visible.shape, dtype=bool)
-    masks = wrong_masks(outlines, _gaps(outlines, poses, change))
-    wrong[outlines.view[masks], outlines.item[masks]] = True
-    if wrong.any():
-        notes.append(f"{wrong.sum()} masks show more than their object, so say other views: void")
-    return Corrected(world_to_camera, wrong, notes)
+        gaps = corrected
+    wrong = wrong_masks(outlines, gaps)
+    if _median_px(gaps) <= _FIT_PX and wrong.any():
+        seen = _without(seen, outlines, wrong)
+        notes.append(f"{wrong.sum()} masks show more than other views of their object: void")
+    return Corrected(moved, seen, notes)
+
+
+def _poses_err(outlines: Outlines, poses: np.ndarray) -> bool:
+    """True if a correction that fits some objects makes others agree, too, as no overfitting does.
+
+    The objects are halved by their numbers, and each half is judged by the other's correction.
+    """
+    odd = outlines.item[outlines.pairs[:, 0]] % 2 == 1
+    given, corrected = [], []
+    for half in (odd, ~odd):
+        change = _adjusted(outlines._replace(pairs=outlines.pairs[half]), poses)
+        others = outlines._replace(pairs=outlines.pairs[~half])
+        for sizes, each in ((given, 0 * change), (corrected, change)):
+            gaps = _gaps(others, poses, each)
+            sizes.append(np.abs(gaps.gaps_px[_used(gaps)]))
+    before, after = (np.concatenate(sizes) for sizes in (given, corrected))
+    if not len(before) or not len(after):
+        return False
+    return bool(np.median(after) < LESS * np.median(before))
+
+
+def _without(seen: Observations, outlines: Outlines, wrong: np.ndarray) -> Observations:
+    images, void = seen.instance_ids.astype(np.uint32), len(seen.object_class) + 1
+    for view, item in zip(outlines.view[wrong], outlines.item[wrong], strict=True):
+        images[view][images[view] == item + 1] = void
+    return observe(images, np.append(seen.object_class, VOID))
 
 
 def moved_cameras(

@@ -14,8 +14,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from scipy.spatial import ConvexHull
 
-from sceneprior.core.instances.observations import TOUCH_PX
-from sceneprior.core.shards import Sightings
+from sceneprior.core.instances.observations import TOUCH_PX, Observations
 
 PAIRS_AT_MOST = 20_000
 """Maximum number of pairs of masks; if there are more, they are thinned evenly."""
@@ -60,9 +59,8 @@ class Gaps(NamedTuple):
     """False if the cameras are too near to each other, or one stands before the object."""
 
 
-def find_outlines(seen: Sightings, intrinsics: Float[np.ndarray, "views 3 3"]) -> Outlines:
+def find_outlines(seen: Observations, intrinsics: Float[np.ndarray, "views 3 3"]) -> Outlines:
     """Convex hulls of all visible masks; `intrinsics` are in pixels of the images."""
-    assert seen.instance_ids is not None, "observed in images"
     rays, clear, names = [], [], []
     for view, image in enumerate(seen.instance_ids):
         places = ndimage.find_objects(image)

@@ -9,6 +9,7 @@ from data_prep.engine.source import PreparedRoom
 from data_prep.frames import choose_frames, first_fault, room_cameras, shrunk
 from data_prep.heading import find_turn, note_of_turn, turn_matrix
 from data_prep.posed.cameras import UP, cameras_in_room, upright_cameras
+from data_prep.posed.corrected import correct
 from data_prep.posed.floor import find_floor
 from data_prep.posed.mask_format import MaskFormat
 from data_prep.posed.masks import RoomMasks
@@ -123,6 +124,11 @@ def prepare_posed(
     seen = observe(images, classes)
     if not len(seen.tracked):
         return None
+    found = correct(seen, cameras, intrinsics)
+    seen = found.seen
+    notes += found.notes
+    if found.world_to_camera is not None:
+        cameras, upright = found.world_to_camera, np.linalg.inv(found.world_to_camera)
     views = seen.room_views(room_name(recording.folder), cameras, intrinsics, thinned_stuff(stuff))
     degrees = find_turn(views)
     notes += note_of_turn(degrees)
