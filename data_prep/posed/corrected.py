@@ -25,7 +25,7 @@ _TOO_WIDE, _TOO_WIDE_PX = 0.1, 3.0
 this many pixels."""
 _FIT_PX = 1.5
 """Median gap up to which poses fit well enough to tell which masks are wrong."""
-_MOST_AGREE, _LEAST_PAIRS = 0.5, 2
+_MOST_AGREE, _LEAST_PAIRS = 0.6, 4
 """A mask is wrong if it is too wide for more than this share of the object's other masks, of which
 at least so many can be compared."""
 _DIGITS = 6
