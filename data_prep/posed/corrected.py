@@ -10,10 +10,12 @@ from data_prep.posed.tangents import Gaps, Outlines, find_outlines, measure_gaps
 from sceneprior.core.classes import VOID
 from sceneprior.core.instances.observations import Observations, observe
 
-LESS = 0.9
-"""Poses are corrected if a correction that is fitted to one half of the objects makes the median
-gap of the other half smaller than this share of what it was. Where poses are exact, it is at least
-0.99 of it, also with ragged masks."""
+WRONG_PX, LESS = 0.3, 0.9
+"""Poses are corrected if the median gap exceeds `WRONG_PX`, and if a correction that is fitted to
+one half of the objects makes that of the other half smaller than the share `LESS` of what it was.
+Exact poses have at most 0.24 px with exact masks, and at least 0.99 of it with ragged ones."""
+_LEAST_GAPS = 30
+"""Fewer gaps tell nothing."""
 TURN_RAD, MOVE_M = np.radians(1.0), 0.02
 """Assumed standard deviations of the errors of a pose; they keep poses that the masks do not
 determine where they are."""
@@ -24,7 +26,8 @@ _TOO_WIDE, _TOO_WIDE_PX = 0.1, 3.0
 """A mask is too wide for another one if it exceeds that one's range of planes by this share, and by
 this many pixels."""
 _FIT_PX = 1.5
-"""Median gap up to which poses fit well enough to tell which masks are wrong."""
+"""Median gap up to which poses fit the masks. If no correction comes so far, something else is wrong,
+which `inspect --verify` may name; and it cannot be told which masks are wrong."""
 _MOST_AGREE, _LEAST_PAIRS = 0.6, 4
 """A mask is wrong if it is too wide for more than this share of the object's other masks, of which
 at least so many can be compared."""
@@ -54,17 +57,17 @@ def correct(
     """
     outlines, notes = find_outlines(seen, intrinsics), []
     poses, as_given = world_to_camera.astype(np.float64), np.zeros((len(world_to_camera), 6))
-    gaps, moved = _gaps(outlines, poses, as_given), None
-    if _poses_err(outlines, poses):
-        change = _adjusted(outlines, poses)
-        moved, corrected = moved_cameras(poses, change), _gaps(outlines, poses, change)
+    change = _adjusted(outlines, poses)
+    gaps, corrected = (_gaps(outlines, poses, each) for each in (as_given, change))
+    before, after = _median_px(gaps), _median_px(corrected)
+    moved = None
+    if before > WRONG_PX and after <= _FIT_PX and _poses_err(outlines, poses):
+        moved, gaps = moved_cameras(poses, change), corrected
         turned, shifted = (np.median(np.linalg.norm(part, axis=1)) for part in np.hsplit(change, 2))
         notes.append(
             f"poses are corrected by {np.degrees(turned):.2f} degrees and {100 * shifted:.1f} cm "
-            f"(medians): outlines now agree to {_median_px(corrected):.2f} pixels, before to "
-            f"{_median_px(gaps):.2f}"
+            f"(medians): outlines now agree to {after:.2f} pixels, before to {before:.2f}"
         )
-        gaps = corrected
     wrong = wrong_masks(outlines, gaps)
     if _median_px(gaps) <= _FIT_PX and wrong.any():
         seen = _without(seen, outlines, wrong)
@@ -86,9 +89,8 @@ def _poses_err(outlines: Outlines, poses: np.ndarray) -> bool:
             gaps = _gaps(others, poses, each)
             sizes.append(np.abs(gaps.gaps_px[_used(gaps)]))
     before, after = (np.concatenate(sizes) for sizes in (given, corrected))
-    if not len(before) or not len(after):
-        return False
-    return bool(np.median(after) < LESS * np.median(before))
+    enough = min(len(before), len(after)) >= _LEAST_GAPS
+    return bool(enough and np.median(after) < LESS * np.median(before))
 
 
 def _without(seen: Observations, outlines: Outlines, wrong: np.ndarray) -> Observations:
