@@ -26,8 +26,8 @@ _TOO_WIDE, _TOO_WIDE_PX = 0.1, 3.0
 """A mask is too wide for another one if it exceeds that one's range of planes by this share, and by
 this many pixels."""
 _FIT_PX = 1.5
-"""Median gap up to which poses fit the masks. If no correction comes so far, something else is wrong,
-which `inspect --verify` may name; and it cannot be told which masks are wrong."""
+"""Median gap up to which poses fit the masks. If no correction comes so far, something else is
+wrong, which `inspect --verify` may name; and it cannot be told which masks are wrong."""
 _MOST_AGREE, _LEAST_PAIRS = 0.6, 4
 """A mask is wrong if it is too wide for more than this share of the object's other masks, of which
 at least so many can be compared."""

@@ -69,7 +69,7 @@ def test_gaps_match_the_definition(given):
         inside = (ends[0] - ends[1]) * [1, -1]
         px_per_rad = gaps.gaps_px[pair] / inside
         assert (np.sign(gaps.gaps_px[pair]) == np.sign(inside)).all()
-        assert ((0 < px_per_rad) & (px_per_rad < intrinsics[0, 0, 0])).all()
+        assert ((px_per_rad > 0) & (px_per_rad < intrinsics[0, 0, 0])).all()
         widths = np.ptp(ends, axis=1)
         np.testing.assert_allclose(gaps.widths_px[pair] / widths, px_per_rad.mean(), rtol=1e-6)
 
