@@ -55,7 +55,8 @@ def correct(
     Poses stay as they are if they agree with the masks, or if no small correction makes them agree.
     The room as a whole keeps its place. If no mask is wrong, `seen` is returned itself.
     """
-    outlines, notes = find_outlines(seen, intrinsics), []
+    outlines = find_outlines(seen, intrinsics)
+    notes: list[str] = []
     poses, as_given = world_to_camera.astype(np.float64), np.zeros((len(world_to_camera), 6))
     change = _adjusted(outlines, poses)
     gaps, corrected = (_gaps(outlines, poses, each) for each in (as_given, change))
@@ -81,7 +82,8 @@ def _poses_err(outlines: Outlines, poses: np.ndarray) -> bool:
     The objects are halved by their numbers, and each half is judged by the other's correction.
     """
     odd = outlines.item[outlines.pairs[:, 0]] % 2 == 1
-    given, corrected = [], []
+    given: list[np.ndarray] = []
+    corrected: list[np.ndarray] = []
     for half in (odd, ~odd):
         change = _adjusted(outlines._replace(pairs=outlines.pairs[half]), poses)
         others = outlines._replace(pairs=outlines.pairs[~half])

@@ -64,7 +64,7 @@ def find_outlines(seen: Observations, intrinsics: Float[np.ndarray, "views 3 3"]
     rays, clear, names = [], [], []
     for view, image in enumerate(seen.instance_ids):
         places = ndimage.find_objects(image)
-        for item in np.flatnonzero(seen.visible[view]):
+        for item in np.flatnonzero(seen.visible[view]).tolist():
             corners = hull_corners(image, item + 1, places[item])
             clear.append(_clear_corners(image, item + 1, corners))
             points = np.concatenate([corners, np.ones((len(corners), 1))], axis=1)
@@ -72,12 +72,12 @@ def find_outlines(seen: Observations, intrinsics: Float[np.ndarray, "views 3 3"]
             rays.append(points / np.linalg.norm(points, axis=1, keepdims=True))
             names.append((view, item))
     most = max((len(corners) for corners in rays), default=1)
-    view, item = np.array(names, dtype=np.int64).reshape(-1, 2).T
-    pairs = np.argwhere((item[:, None] == item) & (view[:, None] < view))
+    of_view, of_item = np.array(names, dtype=np.int64).reshape(-1, 2).T
+    pairs = np.argwhere((of_item[:, None] == of_item) & (of_view[:, None] < of_view))
     return Outlines(
         np.stack([np.pad(each, ((0, most - len(each)), (0, 0)), mode="edge") for each in rays]),
         np.stack([np.pad(each, (0, most - len(each)), mode="edge") for each in clear]),
-        view, item, intrinsics[view, 0, 0].astype(np.float64),
+        of_view, of_item, intrinsics[of_view, 0, 0].astype(np.float64),
         pairs[:: max(1, -(-len(pairs) // PAIRS_AT_MOST))],
     )  # fmt: skip
 
