@@ -10,6 +10,7 @@ other names of `NOISES` are parts of it.
 import argparse
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,13 +19,18 @@ from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 
 from data_prep.posed.corrected import correct
-from data_prep.tracks.associate import FrameMasks, associate
+from data_prep.tracks.associate import FrameMasks, Tracks, associate
+from sceneprior.core.classes import VOID
 from sceneprior.core.instances.observations import observe
 from sceneprior.core.overlaps import box_iou_3d
 from sceneprior.core.shards import RoomGroundTruth, RoomViews, Shard, list_shards
-from sceneprior.lifted.lifting.boxes import lift_boxes
+from sceneprior.lifted.lifting.boxes import LiftedBoxes, lift_boxes
 
 UNKNOWN = -1
+HEADER = (
+    "| rooms | masks | ARI | least ARI | objects found / true | box IoU | with true ids | CPU s |\n"
+    "| --- | --- | --- | --- | --- | --- | --- | --- |"
+)
 
 
 class Noise(NamedTuple):
@@ -140,24 +146,34 @@ class Score(NamedTuple):
     seconds: float
 
 
-def score(views: RoomViews, truth: RoomGroundTruth, noise: Noise, seed: int) -> Score:
-    """Find the objects of one room from its masks, and compare them with the true objects."""
-    assert views.instance_ids is not None
+class Found(NamedTuple):
+    """Objects found from the masks of single frames."""
+
+    frames: Frames
+    tracks: Tracks
+    seconds: float
+
+
+def find(views: RoomViews, noise: Noise, seed: int) -> Found:
+    """Find the objects of one room from its masks, as `prep-posed --tracks auto` does."""
     frames = shuffled(views, noise, seed)
     start = time.process_time()
-    found = associate(frames.masks, frames.world_to_camera, views.intrinsics)
-    seconds = time.process_time() - start
-    true, ids = views.instance_ids.astype(np.int64), frames.masks.ids
+    tracks = associate(frames.masks, frames.world_to_camera, views.intrinsics)
+    return Found(frames, tracks, time.process_time() - start)
+
+
+def score(views: RoomViews, truth: RoomGroundTruth, found: Found) -> Score:
+    """Compare the objects found in one room with the true objects."""
+    assert views.instance_ids is not None
+    (masks, poses), tracks = found.frames, found.tracks
+    true, ids = views.instance_ids.astype(np.int64), masks.ids
     count = len(views.object_class)
     judged = (ids > 0) & (true > 0) & (true <= count)
-    named = ideal_ids(ids, views)
-    iou, iou_true_ids = (
-        _mean_iou(*_boxes(views, image, classes, frames.world_to_camera), truth, count)
-        for image, classes in ((found.ids, found.object_class), (named, views.object_class))
-    )
-    visible = observe(np.maximum(found.ids, 0).astype(np.uint32), found.object_class).tracked
-    rand = rand_index(true[judged], np.maximum(found.ids[judged], 0))
-    return Score(rand, len(visible), count, iou, iou_true_ids, seconds)
+    seen = observed(views, tracks.ids, tracks.object_class, poses)
+    ideal = observed(views, ideal_ids(ids, views), views.object_class, poses)
+    iou, iou_true_ids = (_mean_iou(lift_boxes(each), truth, count) for each in (seen, ideal))
+    rand = rand_index(true[judged], np.maximum(tracks.ids[judged], 0))
+    return Score(rand, len(seen.object_class), count, iou, iou_true_ids, found.seconds)
 
 
 def ideal_ids(ids: np.ndarray, views: RoomViews) -> np.ndarray:
@@ -187,25 +203,25 @@ def rand_index(a: np.ndarray, b: np.ndarray) -> float:
     return 1.0 if most == chance else (pairs(table) - chance) / (most - chance)
 
 
-def _boxes(
-    views: RoomViews, ids: np.ndarray, classes: np.ndarray, poses: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Centres and sizes of the boxes lifted from images of object ids, after the corrections of
-    `prep-posed`."""
+def observed(
+    views: RoomViews, ids: np.ndarray, classes: np.ndarray, world_to_camera: np.ndarray
+) -> RoomViews:
+    """Views of the room as shards hold them, with other ids, classes and poses, after the
+    corrections of `prep-posed`."""
     void = len(classes) + 1
-    seen = observe(np.where(ids < 0, void, ids).astype(np.uint32), [*classes.tolist(), 0])
-    found = correct(seen, poses, views.intrinsics)
+    seen = observe(np.where(ids < 0, void, ids).astype(np.uint32), [*classes.tolist(), VOID])
+    found = correct(seen, world_to_camera, views.intrinsics)
     if found.world_to_camera is not None:
-        poses = found.world_to_camera
-    boxes = lift_boxes(found.seen.room_views(views.room_id, poses, views.intrinsics))
-    return boxes.centers_m, boxes.sizes_m
+        world_to_camera = found.world_to_camera
+    made = found.seen.room_views(views.room_id, world_to_camera, views.intrinsics)
+    return replace(made, stuff=views.stuff)
 
 
-def _mean_iou(centers: np.ndarray, sizes: np.ndarray, truth: RoomGroundTruth, count: int) -> float:
+def _mean_iou(boxes: LiftedBoxes, truth: RoomGroundTruth, count: int) -> float:
     """Mean IoU of the true tracked objects with their assigned boxes; 0 for objects without a
     box."""
     near = truth.centers_m[:count], truth.sizes_m[:count]
-    iou = box_iou_3d(centers, sizes, *near)
+    iou = box_iou_3d(boxes.centers_m, boxes.sizes_m, *near)
     return float(iou[linear_sum_assignment(-iou)].sum() / count)
 
 
@@ -232,11 +248,7 @@ def main() -> None:
     parser.add_argument("--noise", choices=NOISES, nargs="+", default=["clean", "noisy"])
     parser.add_argument("--each", action="store_true", help="print every room")
     options = parser.parse_args()
-    print(
-        "| rooms | masks | ARI | least ARI | objects found / true | box IoU | with true ids "
-        "| CPU s |"
-    )
-    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
+    print(HEADER)
     for folder in options.shards:
         for name in options.noise:
             scores = []
@@ -244,20 +256,25 @@ def main() -> None:
                 for place, (views, truth) in enumerate(
                     rooms(folder, options.split, options.first, options.rooms)
                 ):
-                    scores.append(score(views, truth, NOISES[name], 1000 * seed + place))
+                    found = find(views, NOISES[name], 1000 * seed + place)
+                    scores.append(score(views, truth, found))
                     if options.each:
                         print(
                             place, views.room_id[:20], *(f"{x:.3f}" for x in scores[-1]), flush=True
                         )
-            rand, found, true, iou, with_ids, seconds = np.array(scores).T
-            print(
-                f"| {folder.name} {options.split} ({len(scores)}) "
-                f"| {name} "
-                f"| {rand.mean():.3f} | {rand.min():.3f} | {found.sum():.0f} / {true.sum():.0f} "
-                f"| {iou.mean():.3f} | {with_ids.mean():.3f} "
-                f"| {np.median(seconds):.2f}, at most {seconds.max():.2f} |",
-                flush=True,
-            )
+            print(table_row(f"{folder.name} {options.split}", name, scores), flush=True)
+
+
+def table_row(rooms: str, noise: str, scores: list[Score]) -> str:
+    """Row of the table that begins with `HEADER`."""
+    rand, found, true, iou, with_ids, seconds = np.array(scores).T
+    return (
+        f"| {rooms} ({len(scores)}) "
+        f"| {noise} "
+        f"| {rand.mean():.3f} | {rand.min():.3f} | {found.sum():.0f} / {true.sum():.0f} "
+        f"| {iou.mean():.3f} | {with_ids.mean():.3f} "
+        f"| {np.median(seconds):.2f}, at most {seconds.max():.2f} |"
+    )
 
 
 if __name__ == "__main__":

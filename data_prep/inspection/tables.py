@@ -60,7 +60,8 @@ def count_tables(folder: Path) -> list[Table]:
 
 
 def room_table(folder: Path, room_id: str) -> Table:
-    """Table of one room's objects; `share` is the mean area of an object's 2D boxes."""
+    """Table of one room's objects, numbered as in its images; `share` is the mean area of an
+    object's 2D boxes."""
     ((path, _, _),) = choose_views(folder, room_id, 1)
     with Shard(path) as shard:
         views = shard.read_room(room_id)
@@ -74,7 +75,7 @@ def room_table(folder: Path, room_id: str) -> Table:
         place = ["unknown"] * 2
         if truth is not None:
             place = [" ".join(f"{m:.2f}" for m in of[k]) for of in (truth.centers_m, truth.sizes_m)]
-        rows.append((k, names[index], len(boxes), share, *place))
+        rows.append((k + 1, names[index], len(boxes), share, *place))
     columns = ("object", "class", "views", "share of image", "centre, m", "size, m")
     table = make_table(columns, rows)
     turned = f" (turned by {views.turned_deg:.2f} degrees)" if views.turned_deg else ""

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from data_prep.posed.labels import find_table
+from data_prep.posed.labels import TABLES, find_table
 from data_prep.posed.mask_format import MaskFormat
 from data_prep.posed.recording import INSTANCES, PosedFrame
 from sceneprior.core.errors import InputError
@@ -24,6 +24,12 @@ class IdPngs(MaskFormat):
     def find(cls, folder: Path) -> list[Path]:
         inside = folder / INSTANCES
         return sorted(inside.rglob("*.png")) + sorted(inside.rglob("*.json"))
+
+    @property
+    def tracked(self) -> bool:
+        """False if the classes are beside each PNG and the room has no table."""
+        beside = (self.folder / INSTANCES).rglob("*.json")
+        return any((self.folder / name).is_file() for name in TABLES) or not any(beside)
 
     def has(self, frame: PosedFrame) -> bool:
         return frame.instances.is_file()

@@ -103,5 +103,8 @@ def test_tables_say_how_far_rooms_were_turned(tmp_path):
         r"1 rooms were turned to lie along their walls and furniture, by (\S+) to \1 degrees\.",
         caption,
     )
-    title = room_table(tmp_path / "shards", "attic").title
+    table = room_table(tmp_path / "shards", "attic")
+    assert list(map(str, table.columns[0].cells)) == ["1", "2"], "as in the images of ids"
+    title = table.title
+    assert title is not None
     assert re.fullmatch(r"attic \(turned by -?[12]\d\.\d\d degrees\)", title)

@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 from posed_files import SET, PosedRoom, prepared
 
+from data_prep.posed.source import PosedSource
 from data_prep.posed.views import PosedSettings
 from sceneprior.core.errors import InputError
 
@@ -60,6 +61,16 @@ def test_ids_of_single_frames_are_joined(room, unique):
     made = prepared(room, tracks="auto")
     same_objects(made.views, plain)
     assert any("3 objects are found from" in note for note in made.notes)
+
+
+def test_classes_beside_each_png_need_no_option(room):
+    plain = prepared(room).views
+    shuffle(room, unique=False)
+    made = prepared(room)
+    same_objects(made.views, plain)
+    assert any("3 objects are found from" in note for note in made.notes)
+    (said,) = (text for text in PosedSource(room.folder, SET).assumptions() if "--tracks" in text)
+    assert said.startswith("In 1 of 1 rooms ids belong to single images (PNGs of ids")
 
 
 def test_right_ids_stay_as_they_are(room):
