@@ -80,7 +80,8 @@ class Places(NamedTuple):
     """Centre x, z and extents x, z of the objects already placed."""
     is_object: Bool[Tensor, "rooms objects"]
     meets: Bool[Tensor, "rooms objects"]
-    """True for objects that overlap with the next object in height."""
+    """True for placed objects whose vertical extent overlaps with that of the object to be
+    placed."""
     quarters: Int[Tensor, " rooms"]
     """Quarter turns that take the room to the frame."""
 
