@@ -28,15 +28,15 @@ class _Given(NamedTuple):
     """Observations that the boxes of n objects are fitted to, at most V views of each."""
 
     boxes_px: np.ndarray
-    """(n, V, 4)"""
+    """(n, V, 4) 2D boxes in pixels."""
     clear: np.ndarray
     """(n, V, 4) bool: the side is unoccluded (`own_sides`)."""
     chosen: np.ndarray
     """(n, V) bool; false rows are padding."""
     poses: np.ndarray
-    """(n, V, 4, 4)"""
+    """(n, V, 4, 4) world-to-camera matrices."""
     lenses: np.ndarray
-    """(n, V, 3, 3)"""
+    """(n, V, 3, 3) intrinsics in pixels."""
 
 
 def own_sides(seen: Sightings, image_size: tuple[int, int]) -> np.ndarray:

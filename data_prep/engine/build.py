@@ -92,7 +92,8 @@ def _carry_out(job: Job, plan: Plan, run: Run) -> Summary:
 
 
 def _asked_for(source: Source, plan: Plan, shards: list[ShardPlan]) -> list[ShardPlan]:
-    """Shards with a requested room, where `--only` works on a folder planned without it."""
+    """Shards that hold a room selected by `--only`, if the folder was planned without that option;
+    otherwise all shards."""
     if plan.settings["only"] == source.only:
         return shards
     chosen = [

@@ -66,9 +66,10 @@ def _draw_groups(rng: np.random.Generator, count: int, bed: str) -> list[str]:
 
 
 def _place_bed(room: Furnisher, groups: list[str]) -> Piece | None:
-    """Place the bed's headboard at a wall: near its middle, or often in a corner.
+    """Place the bed with its headboard at a wall.
 
-    Double beds and beds with nightstands stand near the middle.
+    Double beds and beds with nightstands stand near the middle of the wall; other beds often stand
+    in a corner.
     """
     wall, models = room.long_wall(), room.catalog[groups[0]]
     if groups[0] == "double_bed" or any("nightstands" in group for group in groups):

@@ -36,7 +36,8 @@ class Formats:
     masks: str | None = None
 
     def masks_of(self, folder: Path, label_set_name: str) -> MaskFormat:
-        """The masks of a room; if it has none, `IdPngs`, so that the error asks for PNGs of ids."""
+        """The masks of a room. If no masks are found, `IdPngs` is returned, whose error message
+        asks the user for PNGs of ids."""
         return self._mask_format(folder)(folder, label_set_name)
 
     def _mask_format(self, folder: Path) -> type[MaskFormat]:

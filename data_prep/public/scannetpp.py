@@ -196,8 +196,8 @@ def _ids(
     groups: list[Group], parts: list[np.ndarray], labels: Labels, vertices: int
 ) -> tuple[np.ndarray, np.ndarray, dict[int, str]]:
     """Number of each vertex, (V,) int32: k + 1 for group k, 0 for the room itself, -1 for no group;
-    index into `STUFF` of each vertex, uint8; and the classes. A vertex of several groups belongs to
-    the smallest."""
+    index into `STUFF` of each vertex, uint8; and the classes. A vertex that several groups share
+    belongs to the smallest of them."""
     numbers = np.full(vertices, -1, dtype=np.int32)
     stuff = np.zeros(vertices, dtype=np.uint8)
     classes = {}

@@ -67,8 +67,8 @@ class PublicSource:
     expected: ClassVar[Expected | None] = None
     reader: Reader
     splits: Path | None = None
-    """CSV of `room or scene,split`; None takes the data set's official split or, without one,
-    splits the scenes 9:1 by the seed."""
+    """CSV with two columns: a room or scene, and its split. None takes the data set's official
+    split or, without one, splits the scenes 9:1 by the seed."""
     max_side: int | None = 480
     """Maximum side of stored images in pixels."""
     max_views: int = 100

@@ -65,9 +65,9 @@ def id_odds(
     labels: Int[np.ndarray, " masks"],
     mask_view: Int[np.ndarray, " masks"],
 ) -> Float[np.ndarray, "masks masks"] | None:
-    """Log-odds that masks show the same object, from their given ids; None if the ids are
-    inconsistent across views. The error rates of ids are measured in clusters that were found
-    without ids."""
+    """Log-odds that each pair of masks shows the same object, from the ids that the data gives
+    them; None if these ids are inconsistent across views. Their error rates are measured on
+    clusters (`labels`) that were found without ids."""
     other_view = mask_view[:, None] != mask_view
     same_id, same = given[:, None] == given, labels[:, None] == labels
     if not (other_view & same).any() or not (other_view & ~same).any():

@@ -36,7 +36,8 @@ WITH_BASELINE_DECODERS = {
     "paper": "sceneprior.apps.decoders:PaperRun",
     "lifted": "sceneprior.apps.decoders:LiftedRun",
 }
-"""Configs of the same methods whose `model.decoder` may be a baseline's."""
+"""Import paths of the configs of our two methods that also accept a baseline's decoder as
+`model.decoder`."""
 
 
 def load_config(name: str, overrides: tuple[str, ...] = ()) -> RunConfig:

@@ -74,7 +74,7 @@ class SceneMatch:
 
     @property
     def class_accuracy(self) -> float | None:
-        """Share of the true objects whose match has the right class; None without objects."""
+        """Share of the true objects whose match has the correct class; None without objects."""
         return float(self.correct.sum()) / self.truth_count if self.truth_count else None
 
     @property

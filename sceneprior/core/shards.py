@@ -90,7 +90,8 @@ class RoomViews(Sightings):
 class RoomGroundTruth:
     """3D ground truth of a room, for evaluation and baselines with 3D supervision.
 
-    The first n of the m rows are the tracked objects.
+    Arrays with m rows have one row per object: the n tracked objects in their order, then those
+    that no view shows.
     """
 
     object_class: np.ndarray

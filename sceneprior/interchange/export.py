@@ -44,7 +44,7 @@ SIMULATORS: Mapping[str, Callable[[Sequence[Scene], Path, ShellName], None]] = {
 """Simulator formats; objects are made physically stable before export (`core/standing.py`)."""
 FORMATS = (*CLASS_FORMATS, *SIMULATORS, "sceneeval", "obj")
 GROWN_M = 0.01
-"""Displacement of walls, in metres, from which a note mentions it."""
+"""Threshold in metres: a note mentions walls that furniture pushed outwards by more."""
 
 
 def export_scenes(

@@ -27,8 +27,8 @@ SIZE_WEIGHT = 0.3
 """Weight of the difference in log extents; see `ALIKE`."""
 COMMON = 3
 """Number of objects, including itself, that a prototype must look like to be common. The most
-frequent prototype of each class is always common. The distinction exists because an odd shape is
-more often badly lifted than truly rare."""
+frequent prototype of each class is always common. The distinction exists because an unusual shape
+is more often an error of lifting than truly rare."""
 COARSE, PARTS = 8, 4
 """Cells along each axis of the coarse grids that are compared (`COARSE`), and of those that the
 sampler's network reads (`PARTS`)."""

@@ -40,7 +40,7 @@ _ENDINGS = (".npz", ".npy", ".json")
 
 
 def marked(distribution: str) -> str:
-    """A distribution's name in tables, with its note from `MARKS`."""
+    """A distribution's name as tables show it, followed by its note in `MARKS`, if it has one."""
     mark = MARKS.get(distribution)
     return distribution if mark is None else f"{distribution}, {mark}"
 

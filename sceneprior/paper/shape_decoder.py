@@ -87,7 +87,8 @@ class ShapeDecoder(ShapeModule):
         with_shape: bool | Bool[Tensor, "rooms shaped"],
         wanted: Bool[Tensor, "rooms wanted"] | None,
     ) -> DecodedScenes:
-        """Meshes in their boxes; the vertices of objects without one lie at their box's centre."""
+        """Add the objects' meshes, placed in their boxes; vertices of objects without a mesh lie at
+        the centre of the box."""
         if with_shape is False:
             return scenes
         dtype = scenes.centers_m.dtype

@@ -203,7 +203,8 @@ def perspective(
     view: CornerView | None = None,
     colors: UInt8[np.ndarray, "objects 3"] | None = None,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw a room with soft shadows, from outside and above a corner: for pages, not for metrics.
+    """Draw a room with soft shadows, seen from outside and above a corner. Report pages show these
+    pictures; no metric uses them.
 
     If `view` is None, a view of `image_size` is fitted to the room; with a common view, pictures of
     several rooms can be compared. If `colors` is None, objects have the colours of their classes.

@@ -174,7 +174,7 @@ class Variant:
     title: str
     """Title of the row; empty if neither the comparison nor a config gives one."""
     made_by: str
-    """Maker of the rooms or reconstructions, as named in captions (`Maker.said`)."""
+    """Name, in captions, of the method that made the rooms or reconstructions (`Maker.said`)."""
     result: Path
     """File of the variant's scores."""
 

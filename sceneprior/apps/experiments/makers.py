@@ -48,7 +48,8 @@ GIVEN = Maker("", "scenes as given, which were made elsewhere")
 
 
 def maker_of_rooms(config: RunConfig, distribution: str | None) -> Maker:
-    """Maker of new rooms that a run draws from a distribution; None is the run's default."""
+    """Name the method with which a run draws new rooms; if `distribution` is None, it is the run's
+    default."""
     if not isinstance(config, PaperConfig | LiftedConfig):
         return BASELINE
     if (distribution or config.distribution) == SAMPLER:
@@ -57,7 +58,7 @@ def maker_of_rooms(config: RunConfig, distribution: str | None) -> Maker:
 
 
 def maker_of_answers(config: RunConfig, fit: str = OBJECTS) -> Maker:
-    """Maker of a run's reconstructions with a fit of `eval-svr`."""
+    """Name the method with which a run reconstructs rooms; `fit` is the option of `eval-svr`."""
     if not isinstance(config, PaperConfig | LiftedConfig):
         return BASELINE
     if isinstance(config, LiftedConfig):

@@ -24,7 +24,8 @@ from sceneprior.training.method import Trained, TrainedReconstructor
 BATCH = 128
 """Number of latents fitted at once: images times restarts."""
 OBJECTS = "objects"
-"""Name of the object-by-object fit (method `lifted`); other names are schedules of latent fits."""
+"""Value of `fit` for the object-by-object fit of the lifted method; any other value names a
+schedule (`SCHEDULES`) with which a latent is fitted."""
 START_BATCH = 256
 """Number of training rooms decoded at once."""
 

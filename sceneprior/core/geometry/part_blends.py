@@ -99,8 +99,9 @@ def matched_outlines(
 ) -> tuple[Float[np.ndarray, "corners 2"], Float[np.ndarray, "corners 2"]]:
     """Give two outlines equally many corners, which correspond by index.
 
-    Corners of the result lie at corresponding points. The points nearest to a corner of the square
-    correspond, and so do points at equal shares of the length between them.
+    Each outline is divided at the four points nearest to the corners of `SQUARE`. These points
+    correspond, and so do points at the same share of the length between two of them. The results
+    have a corner wherever either outline has one.
     """
     if np.array_equal(a, b):
         return a, b

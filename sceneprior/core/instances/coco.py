@@ -32,7 +32,7 @@ class _Image(BaseModel):
 
 
 class Category(BaseModel):
-    """A class of a COCO JSON."""
+    """An entry of `categories` in a COCO JSON: the id and the name of a class."""
 
     id: CocoId
     name: str

@@ -18,7 +18,8 @@ MOVED_M, TURNED_RAD = 0.01, 0.1
 
 @dataclass(frozen=True)
 class Settled:
-    """Motion of a scene's objects in a simulation, and their overlap at the start."""
+    """Motion of a scene's objects during a physics simulation, and how far they overlap at its
+    start."""
 
     moved_m: Float[np.ndarray, " objects"]
     turned_rad: Float[np.ndarray, " objects"]

@@ -1,5 +1,5 @@
-"""Terms of the loss that depend on the parts alone: volume, planes of faces, connected pieces, the
-gap to the floor or the ceiling, and the overhang, for which an object tips over.
+"""Terms of the loss that depend on the parts alone: volume, number of planes that contain faces,
+connected pieces, gap to the floor or the ceiling, and overhang (an object that has one tips over).
 
 Faces lie on `LEVELS` + 1 evenly spaced levels between the sides of the object's box.
 """

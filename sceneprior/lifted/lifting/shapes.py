@@ -10,8 +10,8 @@ from sceneprior.lifted.lifting.lifted import LiftedBoxes, ShapeGrid
 REACH = 0.4
 """`reach` of `hulls.carve`, in cells: parts of this thickness are kept."""
 EMPTY = 0.05
-"""Share of views that see past a cell above which the cell counts as empty. The limit in `boxes.py`
-is higher, because there one wrong cell can move a whole side of a box."""
+"""Threshold: a cell counts as empty if a larger share of the views sees past it. The threshold in
+`boxes.py` is higher, because there one wrong cell can move a whole side of a box."""
 
 
 def lift_shapes(

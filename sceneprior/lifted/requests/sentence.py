@@ -143,7 +143,8 @@ class _Reader:
         return found
 
     def wishes(self) -> Wishes:
-        """Counts of all groups, summed by class, and the relations."""
+        """The counts of all groups of the sentence, summed by class, and the relations between
+        them."""
         counts: list[CountWish] = []
         exact: Counter[str] = Counter()
         for group in self.groups:

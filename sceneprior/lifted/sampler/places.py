@@ -51,7 +51,8 @@ def ramps(lengths_m: Float[Tensor, "*batch n"], knots_m: tuple[float, ...]) -> T
 
 
 class Anchors(NamedTuple):
-    """Positions along an axis, with features of the neighbours of an object at each position."""
+    """Candidate positions of an object along an axis, with features of the neighbours that it would
+    have at each of them."""
 
     at_m: Float[Tensor, "rooms anchors"]
     exists: Bool[Tensor, "rooms anchors"]
@@ -80,7 +81,8 @@ class Places(NamedTuple):
     """Centre x, z and extents x, z of the objects already placed."""
     is_object: Bool[Tensor, "rooms objects"]
     meets: Bool[Tensor, "rooms objects"]
-    """True for objects that overlap with the next object in height."""
+    """True for placed objects whose vertical extent overlaps with that of the object to be
+    placed."""
     quarters: Int[Tensor, " rooms"]
     """Quarter turns that take the room to the frame."""
 
@@ -94,14 +96,14 @@ class Places(NamedTuple):
         return self._along_x().log_prob(x) + self._along_z(x[:, 0]).log_prob(z)
 
     def draw_x(self, uniform: Float[Tensor, "rooms tries 2"]) -> Float[Tensor, "rooms tries"]:
-        """Sample positions along the x axis of the frames, from uniform numbers."""
+        """Sample positions along the frames' x axis. `uniform` holds the random numbers to use."""
         return _sharpened(self._along_x()).drawn(uniform[..., 0], uniform[..., 1:])[..., 0]
 
     def draw(
         self, x: Float[Tensor, " rooms"], uniform: Float[Tensor, "rooms 2"]
     ) -> Float[Tensor, "rooms 2"]:
-        """Sample places in the rooms, given the positions along the x axis of the frames, from
-        uniform numbers."""
+        """Sample each place's z in its frame, given its `x` there, and return both turned to the
+        room's axes. `uniform` holds the random numbers to use, uniform in [0, 1)."""
         z = _sharpened(self._along_z(x)).draw(uniform[:, 0], uniform[:, 1:])[:, 0]
         return turn_places(torch.stack([x, z], dim=-1), -self.quarters % QUARTERS)
 

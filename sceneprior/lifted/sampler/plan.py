@@ -42,7 +42,7 @@ class Plan(NamedTuple):
     """True if the rectangles were sampled; given ones may be larger than the furniture."""
 
     def rows(self, rows: Int[Tensor, " some"]) -> "Plan":
-        """The plan of these rooms."""
+        """This plan, reduced to the rooms with these indices."""
         objects = self.objects.changed(lambda each: each[rows])
         return Plan(objects, self.rectangle_m[rows], self.coming[rows], self.drawn)
 

@@ -33,7 +33,7 @@ class Frame(NamedTuple):
         return cls(rectangle_m, rectangle_m.new_zeros(len(rectangle_m), dtype=torch.int64))
 
     def rows(self, chosen: Tensor) -> "Frame":
-        """The frame of the chosen rooms."""
+        """These frames, reduced to the chosen rooms."""
         return Frame(self.rectangle_m[chosen], self.symmetry[chosen])
 
 
@@ -48,7 +48,7 @@ class Reading(NamedTuple):
     """Output of the query: the context for the next object."""
 
     def rows(self, rows: Int[Tensor, " some"]) -> "Reading":
-        """The outputs of these rooms."""
+        """These outputs, reduced to the rooms with these indices."""
         before = self.before.changed(lambda part: part[rows])
         return Reading(before, self.frame.rows(rows), self.coming[rows], self.context[rows])
 

@@ -63,7 +63,7 @@ class SamplerRooms:
     def see_looks(self, prototypes: Prototypes) -> "SamplerRooms":
         """Set `rooms`, in which every object has a look, and return this data set.
 
-        Only common prototypes are used, since odd prototypes are often badly lifted.
+        Only common prototypes are used, since rare prototypes are often errors of lifting.
         """
         lifted, prototypes = self._lifted, prototypes.common_alone()
         counts = [len(room.explained) for room in lifted.boxes]
@@ -209,8 +209,8 @@ def gaps_m(rooms: RoomBoxes, rectangle_m: Float[Tensor, "rooms 4"]) -> Float[Ten
 def gaps_to_sides_m(
     boxes_m: Float[Tensor, "rooms objects 6"], rectangle_m: Float[Tensor, "rooms 4"]
 ) -> tuple[Float[Tensor, "rooms objects 2"], Float[Tensor, "rooms objects 2"]]:
-    """Gaps in metres between each box and the lower sides of a rectangle along x and z, and between
-    it and the upper sides."""
+    """Gaps in metres, along x and z, between each box and the sides of a rectangle at low x and low
+    z, and between the box and the sides at high x and high z."""
     low, high = rectangle_sides(rectangle_m.unsqueeze(1))
     centre, half = boxes_m[..., [0, 2]], boxes_m[..., [3, 5]] / 2
     return centre - half - low, high - centre - half

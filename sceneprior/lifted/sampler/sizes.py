@@ -20,8 +20,8 @@ SAME_SIZE = 0.13
 gives the val rooms' sizes the highest likelihood
 (docs/experiments/2026-11-25-sizes-that-repeat.md)."""
 COMMON = 2
-"""Number of objects that an entry must have, unless no entry of its prototype has as many. An odd
-size is more often badly lifted than truly rare."""
+"""Number of objects that an entry must have, unless no entry of its prototype has as many. An
+unusual size is more often an error of lifting than truly rare."""
 
 
 def find_sizes(

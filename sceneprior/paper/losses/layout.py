@@ -86,7 +86,8 @@ def completeness_loss(
     target: str = "first_n",
     per_room: bool = False,
 ) -> Float[Tensor, "*rooms"]:
-    """L_p of Eq. 7: binary cross entropy of all completeness scores; `target` is the convention."""
+    """L_p of Eq. 7: binary cross entropy of all completeness scores. `target` is the convention of
+    their targets (`completeness_targets`)."""
     logits = scenes.completeness_logits
     wanted = completeness_targets(views.is_object.sum(dim=-1), logits.shape[1], target)
     wanted = wanted.to(logits.dtype)

@@ -211,7 +211,8 @@ def _cover_backward(
 
 
 def cover(pixels, depths, faces, windows, settings):
-    """Odds and orders of all windows, and the nearest outline point of each pixel."""
+    """Odds P (coverage = 1 - 1 / P) and orders (1 / depth) at the pixels of all windows, and the
+    nearest outline point of each pixel."""
     mesh = topology_of(faces)
     size = windows.start[-1]
     odds = np.empty(size, dtype=pixels.dtype)
