@@ -151,16 +151,16 @@ class AxisScore(nn.Module):
 
     def forward(self, places: Places, anchors: Anchors) -> LogisticMixture:
         """The mixture along the axis of the `anchors`."""
-        given = self.own(places.own).unsqueeze(1) + self.there(places.there) + self.relation.bias
-        # The sum over objects counts nothing for padding. Only small tensors are touched for this:
-        # those of all anchors and objects are so large that each pass over them takes time.
+        given = self.own(places.own).unsqueeze(1) + self.there(places.there)
+        # Padding adds relu(-inf) = 0. The tensors of all anchors and objects are so large that each
+        # pass over them takes time, so they are changed in place.
         given = given.masked_fill(~places.is_object.unsqueeze(-1), -torch.inf).unsqueeze(1)
         widths = [part.shape[-1] for part in anchors.relations]
         for part, weight in zip(
             anchors.relations, self.relation.weight.split(widths, 1), strict=True
         ):
-            given = given + part @ weight.T
-        pairs = torch.relu_(given)
+            given = (part @ weight.T).add_(given)
+        pairs = given.add_(self.relation.bias).relu_()
         known = self.sides(anchors.sides) + self.anchor(anchors.kind)
         hidden = (
             self.pooled(pairs.sum(dim=2) / 2) + known + self.anchor_own(places.own).unsqueeze(1)

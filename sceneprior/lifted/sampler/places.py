@@ -60,7 +60,7 @@ class Anchors(NamedTuple):
     """0 to 7 for anchors given by the room, 8 to 14 for anchors of an object."""
     relations: tuple[Float[Tensor, "rooms #anchors objects _"], ...]
     """Features of the relations to the objects, in several tensors. A tensor that is the same for
-    all anchors has size 1 along that axis."""
+    all anchors has size 1 along that axis, and precedes the others."""
     sides: Float[Tensor, "rooms anchors features"]
 
 
