@@ -41,7 +41,7 @@ ROUNDS = 16
 """Maximum number of attempts to furnish a room before it is planned anew."""
 PLANS = 3
 """Maximum number of plans of a room."""
-BATCH = 256
+BATCH = 512
 """Number of rooms sampled at a time."""
 SIDE_BY_SIDE = 32
 """Number of attempts made at a time, if fewer rooms are left."""

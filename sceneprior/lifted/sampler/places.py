@@ -46,8 +46,8 @@ def ramps(lengths_m: Float[Tensor, "*batch n"], knots_m: tuple[float, ...]) -> T
         tensor([0.5000, 0.0000])
     """
     knots = torch.tensor(knots_m).to(lengths_m)
-    rising = (lengths_m.unsqueeze(-1) - knots[:-1]) / knots.diff()
-    return rising.clamp(0, 1).flatten(-2)
+    rising = lengths_m.unsqueeze(-1) - knots[:-1]
+    return rising.div_(knots.diff()).clamp_(0, 1).flatten(-2)
 
 
 class Anchors(NamedTuple):
