@@ -265,7 +265,7 @@ class LookDecoder(ShapeModule):
             prototype, pose = divmod(look, POSES)
             parts = self.parts(prototype)
             size_m = self.sizes_m[prototype].double().cpu().numpy()
-            surface, (_, mirrored) = self._surface(prototype), turn_of(pose)
+            surface, (_, mirrored) = self.surface(prototype), turn_of(pose)
             vertices = surface.vertices_m @ pose_rotation(pose).T
             # Mirroring inverts the faces: reverse their corners.
             faces = surface.faces[:, ::-1].copy() if mirrored else surface.faces
@@ -278,7 +278,7 @@ class LookDecoder(ShapeModule):
         """Indices of the prototypes in use."""
         return (self.object_class != self.unknown).nonzero()[:, 0].tolist()
 
-    def _surface(self, prototype: int) -> Mesh:
+    def surface(self, prototype: int) -> Mesh:
         """The surface of a prototype in [-0.5, 0.5]^3; computed once."""
         if prototype not in self._surfaces:
             self._surfaces[prototype] = Mesh(*surface_of_parts(self.parts(prototype)))
