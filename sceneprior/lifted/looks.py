@@ -110,7 +110,7 @@ class LookDecoder(ShapeModule):
         self.register_buffer("common", torch.zeros(most, dtype=torch.bool))
         self.register_buffer("look_codes", torch.zeros(most * POSES, config.codes))
         self.register_buffer("spread", torch.ones(()))
-        self._surfaces: dict[int, Mesh] = {}
+        self._meshes: dict[int, Mesh] = {}
         self._shapes: dict[int, Posed] = {}
         self._matched: dict[tuple[int, int], tuple[Parts, Parts]] = {}
 
@@ -280,9 +280,9 @@ class LookDecoder(ShapeModule):
 
     def surface(self, prototype: int) -> Mesh:
         """The surface of a prototype in [-0.5, 0.5]^3; computed once."""
-        if prototype not in self._surfaces:
-            self._surfaces[prototype] = Mesh(*surface_of_parts(self.parts(prototype)))
-        return self._surfaces[prototype]
+        if prototype not in self._meshes:
+            self._meshes[prototype] = Mesh(*surface_of_parts(self.parts(prototype)))
+        return self._meshes[prototype]
 
 
 def _box_m(decoded: DecodedScenes, room: int, item: int) -> Float[np.ndarray, "6"]:
