@@ -60,15 +60,21 @@ def shown_looks(looks: Int[np.ndarray, " steps"], kept: Bool[np.ndarray, " steps
     return found
 
 
+def pose_rotation(pose: int) -> Float[np.ndarray, "3 3"]:
+    """The matrix that mirrors and turns a prototype into a pose; its entries are 0 and +-1."""
+    quarters, mirrored = turn_of(pose)
+    rotation: np.ndarray = quarter_rotation(quarters) * ([-1, 1, 1] if mirrored else [1, 1, 1])
+    return rotation
+
+
 def posed_parts(parts: Parts, pose: int) -> Parts:
     """The parts of a prototype in a pose, with mirror images as separate parts."""
-    quarters, mirrored = turn_of(pose)
-    across = quarter_rotation(quarters) * ([-1, 1, 1] if mirrored else [1, 1, 1])
+    across = pose_rotation(pose)
     kind, ends = zip(*parts.solids(), strict=True)
     outline = parts.outline
     if not np.array_equal(outline, SQUARE):
         outline = outline @ across[::2, ::2].T
-        outline = outline[::-1] if mirrored else outline  # stays counter-clockwise
+        outline = outline[::-1] if turn_of(pose)[1] else outline  # stays counter-clockwise
     return Parts(
         np.array(kind), np.zeros(len(kind), np.int64), np.sort(across @ np.stack(ends)), outline
     )
@@ -79,12 +85,10 @@ def stretched_parts(
 ) -> Parts:
     """Stretch parts as an object that consists of `own` is stretched from the extents `size_m` to
     `new_size_m` (`stretched`). Parts are in the frame of the object's box."""
-
-    def moved(points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 3"]:
-        return stretched(points, own, size_m, new_size_m)
-
-    corners = moved(parts.ends.transpose(0, 2, 1).reshape(-1, 3))
-    outline = parts.outline
-    if not np.array_equal(outline, SQUARE):
-        outline = moved(np.insert(outline, 1, 0.0, axis=1))[:, ::2]
-    return parts._replace(ends=corners.reshape(-1, 2, 3).transpose(0, 2, 1), outline=outline)
+    corners = parts.ends.transpose(0, 2, 1).reshape(-1, 3)
+    points = np.concatenate([corners, np.insert(parts.outline, 1, 0.0, axis=1)])
+    corners, outline = np.split(stretched(points, own, size_m, new_size_m), [len(corners)])
+    return parts._replace(
+        ends=corners.reshape(-1, 2, 3).transpose(0, 2, 1),
+        outline=parts.outline if np.array_equal(parts.outline, SQUARE) else outline[:, ::2],
+    )

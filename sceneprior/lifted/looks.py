@@ -4,7 +4,7 @@ It replaces the paper's deformed template; such shapes may have legs, holes and 
 """
 
 from dataclasses import replace
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -14,7 +14,6 @@ from torch import Tensor, nn
 
 from sceneprior.core.geometry.part_blends import blend_parts, matched_parts
 from sceneprior.core.geometry.part_meshes import stretched, surface_of_parts
-from sceneprior.core.geometry.turns import quarter_rotation
 from sceneprior.core.parts import (
     KIND_NAMES,
     MOST_CORNERS,
@@ -25,7 +24,7 @@ from sceneprior.core.parts import (
 )
 from sceneprior.core.scene import Mesh, Solid
 from sceneprior.core.views import DecodedScenes
-from sceneprior.lifted.look_paths import posed_parts, shown_looks, stretched_parts
+from sceneprior.lifted.look_paths import pose_rotation, posed_parts, shown_looks, stretched_parts
 from sceneprior.lifted.prototypes import (
     POSES,
     Prototypes,
@@ -53,6 +52,15 @@ class LookConfig(ShapeModuleConfig):
     def build(self, features: int) -> "LookDecoder":
         """The module for object features of width `features`, freshly initialised."""
         return LookDecoder(features, self)
+
+
+class Posed(NamedTuple):
+    """The shape of a look, in the frame of its box, which spans [-0.5, 0.5] along each axis."""
+
+    parts: Parts
+    surface: Mesh
+    size_m: Float[np.ndarray, "3"]
+    """Extents of the prototype, in this pose."""
 
 
 class LookDecoder(ShapeModule):
@@ -103,6 +111,7 @@ class LookDecoder(ShapeModule):
         self.register_buffer("look_codes", torch.zeros(most * POSES, config.codes))
         self.register_buffer("spread", torch.ones(()))
         self._meshes: dict[int, Mesh] = {}
+        self._shapes: dict[int, Posed] = {}
         self._matched: dict[tuple[int, int], tuple[Parts, Parts]] = {}
 
     def learn_prototypes(self, prototypes: Prototypes) -> None:
@@ -214,12 +223,12 @@ class LookDecoder(ShapeModule):
         assert decoded.looks is not None and decoded.next_looks is not None
         size_m = _box_m(decoded, room, item)[3:]
         pair = int(decoded.looks[room, item]), int(decoded.next_looks[room, item])
-        own = [posed_parts(self.parts(look // POSES), look % POSES) for look in pair]
+        own = [self._posed(look) for look in pair]
         if pair not in self._matched:
-            self._matched[pair] = matched_parts(*own)
+            self._matched[pair] = matched_parts(*(each.parts for each in own))
         here, there = (
-            stretched_parts(parts, each, self._size_m(look), size_m)
-            for parts, each, look in zip(self._matched[pair], own, pair, strict=True)
+            stretched_parts(parts, each.parts, each.size_m, size_m)
+            for parts, each in zip(self._matched[pair], own, strict=True)
         )
         return blend_parts(here, there, share)
 
@@ -241,35 +250,28 @@ class LookDecoder(ShapeModule):
 
     def mesh(self, look: int, box_m: Float[np.ndarray, "6"]) -> Mesh:
         """The mesh of a look, stretched into a box (centre, full extents)."""
-        prototype, pose = divmod(look, POSES)
-        surface = self.surface(prototype)
-        faces = surface.faces
-        if turn_of(pose)[1]:  # mirroring inverts the faces: reverse their corners
-            faces = faces[:, ::-1].copy()
-        return Mesh(self._in_box(surface.vertices_m, look, box_m), faces)
+        own = self._posed(look)
+        vertices = stretched(own.surface.vertices_m, own.parts, own.size_m, box_m[3:])
+        return Mesh(vertices * box_m[3:] + box_m[:3], own.surface.faces)
 
     def solids(self, look: int, box_m: Float[np.ndarray, "6"]) -> tuple[Solid, ...]:
         """The solids of a look in a box (centre, full extents), as `mesh` places its surface."""
-        own = posed_parts(self.parts(look // POSES), look % POSES)
-        return _solids_in(stretched_parts(own, own, self._size_m(look), box_m[3:]), box_m)
+        own = self._posed(look)
+        return _solids_in(stretched_parts(own.parts, own.parts, own.size_m, box_m[3:]), box_m)
 
-    def _size_m(self, look: int) -> Float[np.ndarray, "3"]:
-        """Extents of the prototype of a look, in its pose."""
-        size_m = self.sizes_m[look // POSES].double().cpu().numpy()
-        return turned_extents(size_m[None], look % POSES)[0]
-
-    def _in_box(
-        self, points: Float[np.ndarray, "points 3"], look: int, box_m: Float[np.ndarray, "6"]
-    ) -> Float[np.ndarray, "points 3"]:
-        """Map points from a prototype's frame to the room: stretch, mirror, turn, scale."""
-        prototype, pose = divmod(look, POSES)
-        size_m = self.sizes_m[prototype].double().cpu().numpy()
-        own_m = turned_extents(box_m[None, 3:], pose)[0]
-        placed = stretched(points, self.parts(prototype), size_m, own_m)
-        quarters, mirrored = turn_of(pose)
-        if mirrored:
-            placed = placed * [-1, 1, 1]
-        return placed @ quarter_rotation(quarters).T * box_m[3:] + box_m[:3]
+    def _posed(self, look: int) -> Posed:
+        """The shape of a look; computed once."""
+        if look not in self._shapes:
+            prototype, pose = divmod(look, POSES)
+            parts = self.parts(prototype)
+            size_m = self.sizes_m[prototype].double().cpu().numpy()
+            surface, (_, mirrored) = self.surface(prototype), turn_of(pose)
+            vertices = surface.vertices_m @ pose_rotation(pose).T
+            # Mirroring inverts the faces: reverse their corners.
+            faces = surface.faces[:, ::-1].copy() if mirrored else surface.faces
+            own_m = turned_extents(size_m[None], pose)[0]
+            self._shapes[look] = Posed(posed_parts(parts, pose), Mesh(vertices, faces), own_m)
+        return self._shapes[look]
 
     @property
     def known(self) -> list[int]:

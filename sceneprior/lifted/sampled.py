@@ -9,7 +9,7 @@ from torch import Tensor
 
 from sceneprior.core.classes import label_set, unknown_class
 from sceneprior.core.errors import InputError
-from sceneprior.core.scene import Scene, SceneObject, quarter_turned
+from sceneprior.core.scene import Mesh, Scene, SceneObject, Solid, quarter_turned
 from sceneprior.core.shell import rectangle
 from sceneprior.core.threads import single_threaded
 from sceneprior.core.views import RoomBoxes
@@ -71,9 +71,7 @@ def scene_of(trained: TrainedLifted, name: str, rooms: RoomBoxes, row: int) -> S
         known = int(sampler.look_class[look]) == index
         if box[1] - box[4] / 2 < HANGS_M:
             box[1] = box[4] / 2  # lifted boxes end a little above the floor
-        filled = _down_to_floor(shapes, look, box) if known else box
-        mesh = shapes.mesh(look, filled) if known else None
-        solids = shapes.solids(look, filled) if known else ()
+        mesh, solids = _shape_in(shapes, look, box) if known else (None, ())
         label = classes[index]
         center, size = tuple(box[:3]), tuple(box[3:])
         # A front at high z, high x, low z or low x is turned by 0, 1, 2 or 3 quarters.
@@ -88,18 +86,20 @@ def scene_of(trained: TrainedLifted, name: str, rooms: RoomBoxes, row: int) -> S
     return Scene(name, trained.config.label_set, tuple(objects), floor_m)
 
 
-def _down_to_floor(
+def _shape_in(
     shapes: LookDecoder, look: int, box_m: Float[np.ndarray, "6"]
-) -> Float[np.ndarray, "6"]:
-    """Extend a box that stands on the floor downwards, so that the lowest part of its look reaches
-    the floor; masks show too little of the lowest parts of some prototypes."""
+) -> tuple[Mesh, tuple[Solid, ...]]:
+    """Mesh and solids of a look in a box. If the box stands on the floor, so does the shape: masks
+    show too little of the lowest parts of some prototypes."""
+    solids = shapes.solids(look, box_m)
     bottom, top = box_m[1] - box_m[4] / 2, box_m[1] + box_m[4] / 2
-    lowest = min(solid.low_m[1] for solid in shapes.solids(look, box_m))
-    if bottom > 0 or lowest <= 0 or lowest >= top / 2:
-        return box_m
-    # Parts keep their relative heights, so the empty share of the height is lowest / top.
-    height = top / (1 - lowest / top)
-    return np.array([box_m[0], top - height / 2, box_m[2], box_m[3], height, box_m[5]])
+    lowest = min(solid.low_m[1] for solid in solids)
+    if bottom <= 0 < lowest < top / 2:
+        # Parts keep their relative heights, so the empty share of the height is lowest / top.
+        height = top / (1 - lowest / top)
+        box_m = np.array([box_m[0], top - height / 2, box_m[2], box_m[3], height, box_m[5]])
+        solids = shapes.solids(look, box_m)
+    return shapes.mesh(look, box_m), solids
 
 
 def class_rows(trained: TrainedLifted, labels: Sequence[str]) -> Int[Tensor, "1 labels"]:

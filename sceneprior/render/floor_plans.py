@@ -50,9 +50,10 @@ def floor_plan(scene: Scene) -> UInt8[np.ndarray, "512 662 3"]:
     for opening in scene.openings:
         ends = pixels(np.array([opening.start_m, opening.end_m]))
         draw.line(ends, fill=DOOR if opening.kind == "door" else WINDOW, width=7)
-    painted = paint_ids(ids, colors, BACKGROUND)
+    painted = Image.fromarray(paint_ids(ids, colors, BACKGROUND))
+    plan.paste(painted, mask=Image.fromarray(np.uint8(255) * (ids > 0)))
     picture = Image.new("RGB", (PLAN_PX + LEGEND_PX, PLAN_PX), BACKGROUND)
-    picture.paste(Image.fromarray(np.where(ids[..., None] > 0, painted, np.asarray(plan))))
+    picture.paste(plan)
     _legend(ImageDraw.Draw(picture), scene, colors, scale)
     return np.asarray(picture)
 

@@ -4,6 +4,7 @@ import json
 import re
 import warnings
 import zipfile
+import zlib
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -64,7 +65,8 @@ def save_scene(scene: Scene, path: Path, shell: ShellName = "none") -> None:
         case ".usda":
             write_whole(path, scene_to_usd(scene, shell_meshes(scene, shell)))
         case ".png":
-            write_whole(path, png_bytes(floor_plan(scene)))
+            # Flat colours: runs alone are 8% larger than all repeats, in two thirds of the time.
+            write_whole(path, png_bytes(floor_plan(scene), compress_type=zlib.Z_RLE))
         case suffix:
             raise InputError(
                 f"{path} ends with '{suffix}', which is not a scene format; end it with one of "

@@ -41,8 +41,10 @@ ROUNDS = 16
 """Maximum number of attempts to furnish a room before it is planned anew."""
 PLANS = 3
 """Maximum number of plans of a room."""
-BATCH = 256
+BATCH = 512
 """Number of rooms sampled at a time."""
+SIDE_BY_SIDE = 32
+"""Number of attempts made at a time, if fewer rooms are left."""
 
 
 @torch.no_grad()
@@ -66,23 +68,36 @@ def draw_rooms(
     keep = given.coming is not None
     slots, waiting = sampler.max_objects, torch.arange(count)
     drawn, rectangle_m = _nothing_drawn(count, slots), torch.zeros(count, 4)
-    for number in range(PLANS * ROUNDS):
-        last = number + 1 == PLANS * ROUNDS
+    number, last = 0, PLANS * ROUNDS - 1
+    while len(waiting) and number <= last:
         if number % ROUNDS == 0:
             plan = plan_rooms(sampler, given, count, (seed, number // ROUNDS))
-        numbers = uniform_numbers(count, slots * (5 + 4 * PLACES), (seed, PLANS + number))
-        numbers = numbers.unflatten(1, (slots, -1))
+        # The very last attempt is by itself, because it places objects in another way.
+        until = min(number + _attempts(len(waiting)), ROUNDS * (number // ROUNDS + 1), last)
+        attempts = range(number, max(until, number + 1))
+        each = (count, slots * (5 + 4 * PLACES))
+        numbers = torch.stack([uniform_numbers(*each, (seed, PLANS + at)) for at in attempts])
+        numbers = numbers.unflatten(2, (slots, -1))
         rectangle_m[waiting] = plan.rectangle_m[waiting]
         stuck = []
         for rows in waiting.split(BATCH):
-            found, found_stuck = _draw(sampler, numbers[rows], plan.rows(rows), last, keep)
+            again = rows.repeat(len(attempts))
+            chance = numbers[:, rows].flatten(0, 1)
+            found, found_stuck = _draw(sampler, chance, plan.rows(again), number == last, keep)
+            by_attempt = found_stuck.unflatten(0, (len(attempts), -1))
+            chosen = by_attempt.int().argmin(dim=0) * len(rows) + torch.arange(len(rows))
             for whole, part in zip(_parts(drawn), _parts(found), strict=True):
-                whole[rows] = part
-            stuck.append(rows[found_stuck])
-        waiting = torch.cat(stuck)
-        if last or not len(waiting):
-            break
+                whole[rows] = part[chosen]
+            stuck.append(rows[by_attempt.all(dim=0)])
+        waiting, number = torch.cat(stuck), attempts.stop
     return replace(drawn, rectangle_m=rectangle_m)
+
+
+def _attempts(rooms: int) -> int:
+    """Number of attempts that are made side by side for each of these rooms, of which the first
+    successful one counts. One after another, the attempts for a few last rooms would take most of
+    the time: a step takes about as long for one room as for `SIDE_BY_SIDE`."""
+    return max(1, SIDE_BY_SIDE // rooms)
 
 
 def _nothing_drawn(count: int, slots: int) -> RoomBoxes:

@@ -151,20 +151,23 @@ class AxisScore(nn.Module):
 
     def forward(self, places: Places, anchors: Anchors) -> LogisticMixture:
         """The mixture along the axis of the `anchors`."""
-        is_object = places.is_object.unsqueeze(-1)
-        given = (self.own(places.own).unsqueeze(1) + self.there(places.there)).unsqueeze(1)
+        given = self.own(places.own).unsqueeze(1) + self.there(places.there)
+        # Padding adds relu(-inf) = 0. The tensors of all anchors and objects are so large that each
+        # pass over them takes time, so they are changed in place.
+        given = given.masked_fill(~places.is_object.unsqueeze(-1), -torch.inf).unsqueeze(1)
         widths = [part.shape[-1] for part in anchors.relations]
         for part, weight in zip(
             anchors.relations, self.relation.weight.split(widths, 1), strict=True
         ):
-            given = given + part @ weight.T
-        pairs = torch.relu(given + self.relation.bias) * is_object.unsqueeze(1)
+            given = (part @ weight.T).add_(given)
+        pairs = given.add_(self.relation.bias).relu_()
         known = self.sides(anchors.sides) + self.anchor(anchors.kind)
         hidden = (
             self.pooled(pairs.sum(dim=2) / 2) + known + self.anchor_own(places.own).unsqueeze(1)
         )
         logit, shift, scale = self.out(self.dropout(torch.relu(hidden))).unbind(dim=-1)
-        table = self.pair_table[places.label.unsqueeze(1), places.object_class] * is_object
+        table = self.pair_table[places.label.unsqueeze(1), places.object_class]
+        table = table * places.is_object.unsqueeze(-1)
         for part, weight in zip(anchors.relations, table.split(widths, dim=-1), strict=True):
             logit = logit + torch.einsum("raof,rof->ra", part, weight)
         logit = logit + torch.einsum("raf,rf->ra", anchors.sides, self.side_table[places.label])

@@ -46,8 +46,8 @@ def ramps(lengths_m: Float[Tensor, "*batch n"], knots_m: tuple[float, ...]) -> T
         tensor([0.5000, 0.0000])
     """
     knots = torch.tensor(knots_m).to(lengths_m)
-    rising = (lengths_m.unsqueeze(-1) - knots[:-1]) / knots.diff()
-    return rising.clamp(0, 1).flatten(-2)
+    rising = lengths_m.unsqueeze(-1) - knots[:-1]
+    return rising.div_(knots.diff()).clamp_(0, 1).flatten(-2)
 
 
 class Anchors(NamedTuple):
@@ -61,7 +61,7 @@ class Anchors(NamedTuple):
     """0 to 7 for anchors given by the room, 8 to 14 for anchors of an object."""
     relations: tuple[Float[Tensor, "rooms #anchors objects _"], ...]
     """Features of the relations to the objects, in several tensors. A tensor that is the same for
-    all anchors has size 1 along that axis."""
+    all anchors has size 1 along that axis, and precedes the others."""
     sides: Float[Tensor, "rooms anchors features"]
 
 

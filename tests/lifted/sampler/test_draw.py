@@ -52,6 +52,27 @@ def test_batches_do_not_matter(sampler, monkeypatch):
     assert_close(parts.boxes_m, whole.boxes_m, atol=1e-4, rtol=0)
 
 
+def test_attempts_side_by_side_are_those_one_after_another(sampler, monkeypatch):
+    kept, made = module._draw, []
+
+    def watched(*given):
+        made.append(len(given[1]))
+        return kept(*given)
+
+    monkeypatch.setattr(module, "_draw", watched)
+    together, calls = draw_rooms(sampler, 12, 1), len(made)
+    assert max(made) > 12
+    made.clear()
+    monkeypatch.setattr(module, "SIDE_BY_SIDE", 1)
+    alone = draw_rooms(sampler, 12, 1)
+    assert max(made) == 12 and len(made) > calls
+    assert together.is_object.any()
+    assert torch.equal(together.object_class, alone.object_class)
+    assert torch.equal(together.looks, alone.looks)
+    assert torch.equal(together.rectangle_m, alone.rectangle_m)
+    assert_close(together.boxes_m, alone.boxes_m, atol=1e-4, rtol=0)
+
+
 def test_objects_are_what_they_say(sampler):
     drawn = draw_rooms(sampler, 30, 0)
     here = drawn.is_object

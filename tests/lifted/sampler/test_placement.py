@@ -104,6 +104,35 @@ def log_probs(one: Places, places_m: torch.Tensor) -> torch.Tensor:
     return torch.cat(parts)
 
 
+@pytest.mark.parametrize("axis", ["x", "z"])
+def test_scores_are_those_of_plain_layers_on_joined_features(placement, given, axis):
+    """Features joined into one tensor, and padding struck from the sum at the end."""
+    score = placement.along_x if axis == "x" else placement.along_z
+    calls = []
+
+    def watched(places, anchors):
+        calls.append((places, anchors, score(places, anchors)))
+        return calls[-1][2]
+
+    places = distribution(placement, *given)._replace(**{f"along_{axis}": watched})
+    places.log_prob(torch.rand(3, 2).double())
+    (places, anchors, found), real = calls[0], places.is_object[:, None, :, None]
+    number = anchors.at_m.shape[1]
+    joined = torch.cat([part.expand(-1, number, -1, -1) for part in anchors.relations], dim=-1)
+    met = score.own(places.own).unsqueeze(1) + score.there(places.there)
+    pooled = (torch.relu(score.relation(joined) + met.unsqueeze(1)) * real).sum(dim=2) / 2
+    hidden = score.pooled(pooled) + score.sides(anchors.sides) + score.anchor(anchors.kind)
+    hidden = hidden + score.anchor_own(places.own).unsqueeze(1)
+    logit, shift, _ = score.out(torch.relu(hidden)).unbind(dim=-1)
+    pairs = score.pair_table[places.label[:, None], places.object_class].unsqueeze(1)
+    logit = logit + (joined * pairs * real).sum(dim=(2, 3))
+    logit = logit + (anchors.sides * score.side_table[places.label].unsqueeze(1)).sum(dim=-1)
+    logit = logit + score.anchor_table[places.label][:, anchors.kind]
+    assert_close(found.weight_logits, logit.masked_fill(~anchors.exists, -torch.inf))
+    assert_close(found.means[..., 0], anchors.at_m + 0.3 * shift)
+    assert not real.all()
+
+
 def test_density_integrates_to_one(placement, given):
     rooms, look, size_m, rectangle_m = given
     one = distribution(placement, rooms, look, size_m, rectangle_m).rows(torch.tensor([0]))
