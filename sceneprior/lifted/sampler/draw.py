@@ -59,13 +59,12 @@ def draw_rooms(
     object has no such place, or if a side of its sampled rectangle stays empty (`OPEN_M`), which is
     rare in training rooms. After `ROUNDS` attempts, the room is planned again.
 
-    In the last attempt, `PLACES` places are sampled. Objects without a place are left out; if their
-    classes were requested, they take the place with the least violation instead.
+    In the last attempt, `PLACES` places are sampled, and objects without a place are left out, also
+    requested ones.
 
     The same seed draws the same rooms, and the first ones do not depend on `count`.
     """
     given = given or nothing_given(count)
-    keep = given.coming is not None
     slots, waiting = sampler.max_objects, torch.arange(count)
     drawn, rectangle_m = _nothing_drawn(count, slots), torch.zeros(count, 4)
     number, last = 0, PLANS * ROUNDS - 1
@@ -83,7 +82,7 @@ def draw_rooms(
         for rows in waiting.split(BATCH):
             again = rows.repeat(len(attempts))
             chance = numbers[:, rows].flatten(0, 1)
-            found, found_stuck = _draw(sampler, chance, plan.rows(again), number == last, keep)
+            found, found_stuck = _draw(sampler, chance, plan.rows(again), number == last)
             by_attempt = found_stuck.unflatten(0, (len(attempts), -1))
             chosen = by_attempt.int().argmin(dim=0) * len(rows) + torch.arange(len(rows))
             for whole, part in zip(_parts(drawn), _parts(found), strict=True):
@@ -115,12 +114,9 @@ def _draw(
     uniform: Float[Tensor, "rooms slots numbers"],
     plan: Plan,
     last: bool,
-    keep: bool,
 ) -> tuple[RoomBoxes, Bool[Tensor, " rooms"]]:
     """Furnish rooms once; also return a mask of the rooms to furnish again, because some object
     found no place, or a side of a sampled rectangle stays empty.
-
-    With `keep`, the last attempt places objects in any case.
     """
     number = plan.objects.is_object.sum(dim=1)
     rooms = with_looks(sampler, uniform, plan)
@@ -139,7 +135,7 @@ def _draw(
         tries = PLACES if last else TRIES
         look, box_m, wrong = _placed(sampler, reading, label, chance[rows], tries)
         stuck[rows] |= wrong > 0
-        placed = (wrong == 0) | (last & keep)
+        placed = wrong == 0
         rows = rows[placed]
         at = (rows, number[rows])
         rooms.object_class[at], rooms.is_object[at] = label[placed], True
