@@ -123,9 +123,17 @@ def test_a_drawn_rectangle_holds_what_is_given(sampler):
 def test_asked_classes_come_and_no_others(sampler):
     none = nothing_given(3).objects
     wanted = torch.tensor([[3, 1, 0], [2, 2, 2], [0, 0, 0]])
-    drawn = draw_rooms(sampler, 3, 0, Given(none, None, wanted))
+    hall = torch.tensor([0.0, 0.0, 30.0, 30.0]).expand(3, 4)
+    drawn = draw_rooms(sampler, 3, 0, Given(none, hall, wanted))
     held = [sorted(row[row > 0].tolist()) for row in drawn.object_class]
     assert held == [[1, 3], [2, 2, 2], []]
+
+
+def test_asked_classes_without_a_place_are_left_out(sampler):
+    none, wanted = nothing_given(2).objects, torch.full((2, 2), 2)
+    closet = torch.tensor([0.0, 0.0, 0.1, 0.1]).expand(2, 4)
+    drawn = draw_rooms(sampler, 2, 0, Given(none, closet, wanted))
+    assert not drawn.is_object.any()
 
 
 def test_a_full_room_takes_nothing_more(sampler):
