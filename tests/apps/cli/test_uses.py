@@ -153,5 +153,5 @@ def test_a_place_that_cannot_be_written_is_a_sentence(
         ("reconstruct", "--run", toy_run, "--shards", toy_shards, "--split", "test"),
     ):
         said = one_sentence(command(*words, "--out", "new"))
-        assert "new cannot be read or written (Read-only file system); name a place that" in said
+        assert "new cannot be read or written (Read-only file system); name a folder that" in said
         assert not (tmp_path / "new").exists()
