@@ -127,7 +127,7 @@ def test_backs_at_the_inner_side_of_an_l_are_no_backs_at_walls():
 
 def test_where_floor_is_scarce_beds_stand_on_it_and_keep_their_size(prior):
     want = {"double_bed": 1, "single_bed": 1, "desk": 2, "sofa": 1}
-    for room in prior.sample(2, seed=0, floor="3x3", openings="door", want=want):
+    for room in prior.sample(2, seed=0, floor="3.2x3", openings="door", want=want):
         for item in room.objects:
             if "bed" in item.label:
                 assert item.center_m[1] - item.size_m[1] / 2 <= 0.151
