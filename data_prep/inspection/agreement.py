@@ -96,7 +96,7 @@ class Comparison(NamedTuple):
 
     @property
     def agreement(self) -> Agreement:
-        """Sums over objects and views."""
+        """The comparison summed over objects and views, for each kind of 3D representation."""
         tallies = {}
         for kind in KINDS:
             of = np.array([name == kind for name in self.kinds], dtype=bool)

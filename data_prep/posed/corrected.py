@@ -165,7 +165,8 @@ def _adjusted(outlines: Outlines, poses: np.ndarray) -> Float[np.ndarray, "views
 def wrong_masks(outlines: Outlines, gaps: Gaps) -> Bool[np.ndarray, " masks"]:
     """True for masks that are too wide for most of the object's masks in other views.
 
-    A mask that is too narrow may be hidden in part; one that is too wide shows something else.
+    A mask that is too narrow may be correct, if the object is partly occluded in this view; one
+    that is too wide shows something besides the object.
     """
     told, against = np.zeros((2, len(outlines.view)), dtype=np.int64)
     for mine, other, wider_px in ((0, 1, -gaps.gaps_px), (1, 0, gaps.gaps_px)):

@@ -1,10 +1,11 @@
-"""Planes through two cameras that touch an object: exact measurements of poses, from masks alone.
+"""Epipolar tangency: measures errors of poses and masks from the masks of two views alone.
 
-The planes through the centres of two cameras form a pencil. Of these, an object fills a range, and
-the two outermost planes touch it. Both cameras see this same range, whatever the object's shape;
-so where the outlines are the object's own, a difference between the ranges is an error of a pose
-or of a mask ("epipolar tangency"; Wong and Cipolla, "Structure and motion from silhouettes", ICCV
-2001).
+The planes through the centres of two cameras (epipolar planes) form a pencil. Those that intersect
+an object are a range of this pencil, and the two planes at the ends of the range are tangent to the
+object. The range is the same in both images, whatever the object's shape; so where the outlines are
+the object's own, not cut off by another object or the image border, a difference between the two
+ranges is an error of a pose or of a mask (Wong and Cipolla, "Structure and motion from
+silhouettes", ICCV 2001).
 """
 
 from typing import NamedTuple

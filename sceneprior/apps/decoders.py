@@ -20,7 +20,7 @@ class AnyPaperModel(PaperModel):
 
 
 class PaperRun(PaperConfig):
-    """A run of the paper's method with any decoder."""
+    """Config of a run of the paper's method with any decoder."""
 
     model: AnyPaperModel
 
@@ -32,6 +32,6 @@ class AnyLiftedModel(LiftedModel):
 
 
 class LiftedRun(LiftedConfig):
-    """A run of the lifted method with any decoder."""
+    """Config of a run of the lifted method with any decoder."""
 
     model: AnyLiftedModel

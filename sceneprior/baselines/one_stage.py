@@ -34,7 +34,8 @@ class OneStageConfig(RunConfig):
 
     @abstractmethod
     def make(self) -> "OneStage":
-        """The module to train, with a fresh network that has no statistics of rooms yet."""
+        """The module to train, with a newly initialised network; `build` adds the statistics of the
+        training rooms, if the method needs any."""
 
     @abstractmethod
     def open_rooms(self) -> Any:

@@ -46,9 +46,11 @@ def read_arrays(
     sizes: dict[str, int],
     classes: int,
 ) -> dict[str, np.ndarray]:
-    """Read arrays of the format; each is checked before memory is allocated for it.
+    """Read arrays of a view shard (such as `VIEW_ARRAYS`); the type and shape of each are checked
+    before memory is allocated for it.
 
-    `sizes` holds the known lengths of named sides; lengths found here are added.
+    Shapes name dimensions by letters, such as T for views. `sizes` maps these names to lengths;
+    the lengths of names that it lacks are taken from the arrays, and added to it.
     """
     read: dict[str, np.ndarray] = {}
     for name, (dtype, sides) in arrays.items():

@@ -1,4 +1,5 @@
-"""The feature networks: EfficientNet-Lite0, and Inception (from the user's file) for FID."""
+"""The networks for features of pictures: EfficientNet-Lite0, whose weights come with a package, and
+Inception for FID, which the user provides as a file."""
 
 import hashlib
 from collections.abc import Callable

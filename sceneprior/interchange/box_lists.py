@@ -111,8 +111,8 @@ def _records(path: Path) -> list[dict[str, Any]]:
 
 
 def _one_by_one(path: Path, record: dict[str, Any]) -> list[dict[str, Any]]:
-    """Split a record into rooms with arrays over objects; its arrays may have a leading axis over
-    rooms."""
+    """Split a record into single rooms. Its arrays have one row per object; if the record holds
+    several rooms, the rooms are an additional first axis."""
     try:
         labels, *boxes = (np.asarray(record[key]) for key in NEEDED)
         centers, sizes, angles = (part.astype(np.float64, casting="same_kind") for part in boxes)

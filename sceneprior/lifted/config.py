@@ -74,7 +74,8 @@ class LiftedModel(ModelConfig):
 
 
 class LiftedConfig(PriorConfig):
-    """A run of the lifted method: 3D boxes and shapes are estimated from masks before training."""
+    """Config of a run of the lifted method, which estimates 3D boxes and shapes from masks before
+    training."""
 
     method: Literal["lifted"] = "lifted"
     model: LiftedModel

@@ -61,7 +61,10 @@ def shown_looks(looks: Int[np.ndarray, " steps"], kept: Bool[np.ndarray, " steps
 
 
 def pose_rotation(pose: int) -> Float[np.ndarray, "3 3"]:
-    """The matrix that mirrors and turns a prototype into a pose; its entries are 0 and +-1."""
+    """The matrix of a pose: a mirror image (x reversed) if the pose has one, then quarter turns.
+
+    Its entries are 0 and +-1.
+    """
     quarters, mirrored = turn_of(pose)
     rotation: np.ndarray = quarter_rotation(quarters) * ([-1, 1, 1] if mirrored else [1, 1, 1])
     return rotation

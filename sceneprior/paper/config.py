@@ -33,7 +33,7 @@ class PaperModel(ModelConfig):
 
 
 class PaperConfig(PriorConfig):
-    """A run of the paper's method."""
+    """Config of a run of the paper's method."""
 
     method: Literal["paper"] = "paper"
     model: PaperModel

@@ -40,11 +40,12 @@ PAUSE_MS = 700
 
 @dataclass(frozen=True)
 class RoomPath:
-    """The geodesic between two latents (in a cube, the straight line) and the rooms on it.
+    """A path between two latents, and the rooms on it.
 
-    Places on the path are numbers from 0 to 1. At 0 and 1, the rooms are those that the two latents
-    decode to. In between, shapes change gradually (`ShapeModule.along_path`), whatever the number
-    of rooms drawn.
+    The path is the geodesic on the sphere, or the straight line in the cube (`LatentCube`). Places
+    on it are numbers from 0 to 1. At 0 and 1, the rooms are those that the two latents decode to.
+    In between, shapes change gradually (`ShapeModule.along_path`). A room depends only on its
+    place, not on how many rooms of the path are computed.
     """
 
     trained: TrainedPrior

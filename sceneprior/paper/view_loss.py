@@ -35,8 +35,8 @@ def first_predictions(views: SceneViews, slots: int) -> Bool[Tensor, "rooms slot
 
 
 def _of_first(project: Callable[..., Boxes2D], views: SceneViews, *objects: Tensor) -> Boxes2D:
-    """Apply `project` to the first predictions of each room only (`first_predictions`); the others
-    get empty boxes outside the frustum."""
+    """Project only the predictions that are matched (`first_predictions`). The others get empty
+    boxes, and count as outside the frustum."""
     rooms, slots = objects[0].shape[:2]
     first = first_predictions(views, slots)
     room = first.nonzero()[:, 0]
@@ -75,7 +75,7 @@ def seen_boxes(scenes: DecodedScenes, views: SceneViews, settings: ShapeConfig |
     (`ShapeConfig.box_from`).
 
     In a room with n tracked objects, only the first n predictions, which are matched, get a box;
-    the others get empty boxes outside the frustum.
+    the others get empty boxes, and count as outside the frustum.
     """
     if settings is None:
         return proxy_boxes(scenes, views, "ellipsoid")

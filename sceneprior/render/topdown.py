@@ -150,7 +150,11 @@ class CornerView:
 
 
 def room_view(scene: Scene, image_size: tuple[int, int] = (360, 480)) -> CornerView:
-    """A view of a room with its floor and the walls behind its furniture, from above a corner."""
+    """A view of a room from outside, above a corner, that just contains it.
+
+    It shows the floor, the furniture, and the walls that lie behind the furniture as seen from the
+    camera; the other walls are left out.
+    """
     shell = shell_of(scene)
     meshes = shell.meshes()
     toward = DIRECTION[[0, 2]]

@@ -20,7 +20,7 @@ FURNITURE = DECODED, MODELS = "decoded", "models"
 
 
 class Panel:
-    """The controls and texts of a page."""
+    """The control panel of a page, with the descriptions of the shown room and its wishes."""
 
     def __init__(self, page: "Page", asked: Mapping[str, Any], shell: ShellName):
         self._page, self._gui = page, page.server.gui

@@ -24,7 +24,7 @@ class AtissTraining(OneStageTraining):
 
 
 class AtissConfig(BoxConfig):
-    """A run of ATISS."""
+    """Config of a run of ATISS."""
 
     method: Literal["atiss"] = "atiss"
     model: AtissModel

@@ -108,7 +108,7 @@ class GanModel(ModelConfig):
 
 
 class GanConfig(PriorConfig):
-    """A run of the GAN, whose objects are never void (docs/baselines_2d.md)."""
+    """Config of a run of the GAN, whose objects are never void (docs/baselines_2d.md)."""
 
     method: Literal["gan"] = "gan"
     model: GanModel

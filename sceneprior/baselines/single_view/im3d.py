@@ -74,7 +74,7 @@ class Im3dTraining(DetectorTraining):
 
 
 class Im3dConfig(DetectorConfig):
-    """A run of Im3D."""
+    """Config of a run of Im3D."""
 
     method: Literal["im3d"] = "im3d"
     model: Im3dModel = Im3dModel()

@@ -46,7 +46,7 @@ class SingleViewTraining(OneStageTraining):
 
 
 class SingleViewConfig(OneStageConfig):
-    """A run of a network that reconstructs the objects of single views."""
+    """Config of a run of a network that reconstructs the objects of single views."""
 
     data: ViewDataConfig
     model: SingleViewModel

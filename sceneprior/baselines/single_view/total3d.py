@@ -275,7 +275,7 @@ class Total3dTraining(DetectorTraining):
 
 
 class Total3dConfig(DetectorConfig):
-    """A run of Total3D."""
+    """Config of a run of Total3D."""
 
     method: Literal["total3d"] = "total3d"
     model: Total3dModel = Total3dModel()

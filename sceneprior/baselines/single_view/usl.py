@@ -63,7 +63,7 @@ class UslTraining(SingleViewTraining):
 
 
 class UslConfig(SingleViewConfig):
-    """A run of USL."""
+    """Config of a run of USL."""
 
     method: Literal["usl"] = "usl"
     model: UslModel = UslModel()
@@ -128,8 +128,8 @@ def other_view_losses(
     others: SceneViews,
     settings: UslTraining,
 ) -> dict[str, Float[Tensor, ""]]:
-    """Losses in the other views, as means over objects: 2D boxes, rays to objects predicted outside
-    a view, and silhouettes.
+    """Losses in the other views, as means over objects: on 2D boxes, on silhouettes, and, where an
+    object is predicted outside a view that shows it, the frustum loss (`frustum_loss`).
 
     Each silhouette is rendered alone. The object may continue behind other objects, so pixels that
     show another object are left out:

@@ -25,7 +25,7 @@ class Sync2genTraining(OneStageTraining):
 
 
 class Sync2genConfig(BoxConfig):
-    """A run of the Sync2Gen-style VAE."""
+    """Config of a run of the Sync2Gen-style VAE."""
 
     method: Literal["sync2gen"] = "sync2gen"
     model: Sync2genModel = Sync2genModel()

@@ -20,7 +20,7 @@ NEAR_M = 0.05
 
 
 class Outlines(NamedTuple):
-    """Extents of masks, and the camera of each."""
+    """The extents of masks in the eight `DIRECTIONS`, and the camera of each mask."""
 
     extents: Float[Tensor, "masks 8"]
     """The largest value of u * direction_u + v * direction_v over a mask, u and v relative to the

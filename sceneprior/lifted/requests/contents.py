@@ -11,7 +11,8 @@ from sceneprior.lifted.sampler.network import RoomSampler
 
 
 def required_rows(wishes: Wishes, classes: tuple[str, ...], given: list[int]) -> list[int]:
-    """Indices of the classes of objects that the wishes require in addition to the given ones."""
+    """The class index of each object that the wishes require beyond those in `given`, the class
+    indices of the objects that are already there."""
     required = []
     for label in wishes.labels:
         index = classes.index(label)

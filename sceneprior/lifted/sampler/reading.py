@@ -54,8 +54,8 @@ class Reading(NamedTuple):
 
 
 def lengths_shown(lengths_m: Float[Tensor, "*batch numbers"]) -> Float[Tensor, "*batch shown"]:
-    """Fourier features of lengths: the lengths themselves (in units of 4 m), their sines and
-    cosines."""
+    """Encode lengths: the lengths themselves (in units of 4 m), then their Fourier features, a sine
+    and a cosine for each of `OCTAVES` periods."""
     octaves = torch.arange(OCTAVES, device=lengths_m.device, dtype=lengths_m.dtype)
     phase = (lengths_m.unsqueeze(-1) * (2 * math.pi / LONGEST_M * 2**octaves)).flatten(-2)
     return torch.cat([lengths_m / 4, phase.sin(), phase.cos()], dim=-1)

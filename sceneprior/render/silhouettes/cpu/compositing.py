@@ -73,7 +73,11 @@ def _sort(order, where, found, lane, sequence, depth):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _compose(first, last, odds, order, bounds, starts, mode, visible, front, front_depth):
-    """Fill the dense `visible` (initially 0), `front` (-1) and `front_depth` (inf)."""
+    """Compute the visible masks, the front-most object and its depth of images[first:last].
+
+    Inputs are packed in windows. Results are written to arrays over whole images, which the caller
+    initialises: `visible` with 0, `front` with -1 and `front_depth` with inf.
+    """
     _, objects, height, width = visible.shape
     T = visible.dtype.type
     one = T(1)

@@ -1,7 +1,7 @@
-"""The exact mode on CUDA: the launches of its kernels, and its backward kernels.
+"""The exact mode on CUDA: coverage of each mesh (kernel in kernels.py), and its gradient.
 
-In the backward pass, each face sums over its pixels, then each vertex over the corners that use
-it, always in the same order.
+The backward pass has two kernels: one sums the gradients of each face's corners over the pixels of
+the face, the other adds them up by vertex. The order of each sum is fixed.
 """
 
 import torch
