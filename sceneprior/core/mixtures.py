@@ -49,22 +49,9 @@ class LogisticMixture(NamedTuple):
 
     def log_prob(self, values: Float[Tensor, "*batch numbers"]) -> Float[Tensor, "*batch"]:
         """Log-densities of values."""
-        each = self._log_prob_by_component(values)
+        away = (values.unsqueeze(-2) - self.means) * torch.exp(-self.log_scales)
+        each = (F.logsigmoid(away) + F.logsigmoid(-away) - self.log_scales).sum(dim=-1)
         return torch.logsumexp(self.weight_logits.log_softmax(dim=-1) + each, dim=-1)
-
-    def given(self, first: Float[Tensor, "*batch known"]) -> "LogisticMixture":
-        """The conditional distribution of the remaining numbers, given the first ones."""
-        known = first.shape[-1]
-        logits = self.weight_logits + self._log_prob_by_component(first)
-        return LogisticMixture(logits, self.means[..., known:], self.log_scales[..., known:])
-
-    def _log_prob_by_component(
-        self, first: Float[Tensor, "*batch known"]
-    ) -> Float[Tensor, "*batch mixtures"]:
-        """Log-densities of the first numbers under each component."""
-        log_scales = self.log_scales[..., : first.shape[-1]]
-        away = (first.unsqueeze(-2) - self.means[..., : first.shape[-1]]) * torch.exp(-log_scales)
-        return (F.logsigmoid(away) + F.logsigmoid(-away) - log_scales).sum(dim=-1)
 
     def drawn(
         self, choice: Float[Tensor, "*batch draws"], place: Float[Tensor, "*batch draws numbers"]

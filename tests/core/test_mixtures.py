@@ -28,14 +28,6 @@ def test_densities_are_those_of_scipy():
     assert_close(every.log_prob(values), torch.tensor(expected, dtype=torch.float64))
 
 
-def test_a_conditional_is_the_joint_over_the_marginal():
-    mixture = some_mixture(numbers=3)
-    values = torch.tensor([0.2, -0.4, 0.7], dtype=torch.float64)
-    first = mixture._replace(means=mixture.means[:, :2], log_scales=mixture.log_scales[:, :2])
-    rest = mixture.given(values[:2])
-    assert_close(rest.log_prob(values[2:]), mixture.log_prob(values) - first.log_prob(values[:2]))
-
-
 def test_scales_stay_within_their_bounds():
     wide = LogisticMixture.of(torch.tensor([0.0, 0.0, 1e4]), 1)
     narrow = LogisticMixture.of(torch.tensor([0.0, 0.0, -1e4]), 1)

@@ -1,10 +1,10 @@
-"""Outlines of furniture seen from above: extraction from visual hulls, and rays cut to them."""
+"""Outlines of furniture seen from above: extraction from visual hulls, rays cut to them, areas."""
 
 from typing import no_type_check
 
 import numpy as np
 import shapely
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numba import njit
 
 from sceneprior.core.parts import MOST_CORNERS, SQUARE
@@ -80,6 +80,16 @@ def cut_rays(starts, spans, outline):
         for axis in range(3):
             starts[ray, axis] += near * spans[ray, axis]
             spans[ray, axis] *= max(far - near, 0.0)
+
+
+def area_table(
+    outline: Float[np.ndarray, "corners 2"], levels: int
+) -> Int[np.ndarray, "edges edges"]:
+    """Number of cells, of a grid over the box, at lower x and z whose centres lie within an
+    outline (a summed-area table)."""
+    centres = (np.arange(levels) + 0.5) / levels - 0.5
+    inside = shapely.contains_xy(shapely.Polygon(outline), *np.meshgrid(centres, centres))
+    return np.pad(inside.T.astype(np.int64).cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
 
 
 def points_within(

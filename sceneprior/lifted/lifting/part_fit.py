@@ -34,6 +34,8 @@ PLACES = (0.25, 0.5, 0.75)
 """Positions at which parts are split, as shares of their length."""
 SHORTEST = 4
 """Length in levels below which a part is not split."""
+SLIT, SLIT_LOSS = 8, 0.002
+"""Width in levels up to which a slit is closed, and the increase of the loss up to which it is."""
 PIECES = 4
 """Number of uncovered pieces of the hull, the largest first, in which new parts are tried."""
 SCREENED, FINALISTS = 768, 6
@@ -64,7 +66,7 @@ def fit_parts(
     some = RayFit(RayPool(*(part[:SCREENED] for part in rays)), margin, outline, hangs)
     while better := _one_more(every, some, guess, hull) or _one_more(every, every, guess, hull):
         guess = better
-    return _joined(every, _needed(every, guess)).parts(outline)
+    return _needed(every, _whole(every, _closed(every, guess))).parts(outline)
 
 
 def _one_more(
@@ -75,7 +77,7 @@ def _one_more(
     tried = []
     # A first part is not curved unless all else fails, or chairs would begin as bowls.
     curved = len(guess.kinds) > 1 or some is every
-    for change in _changes(guess, hull, curved):
+    for change in _changes(guess, hull, curved, every.hangs):
         trial = some.changed(rough, change)
         if all(
             kind == BOX for kind, _, _ in change.values()
@@ -92,10 +94,13 @@ def _one_more(
     return best and every.settled(best, range(len(best.kinds)), 2)
 
 
-def _changes(guess: Guess, hull: Bool[np.ndarray, "x y z"], curved: bool) -> Iterator[Change]:
-    """Changes to try: a different kind for a part; a part mirrored with its own or a quarter of its
-    width; a part split in two, each fitted to the hull; a part extended to the floor; legs or
-    panels below a part; a new part around an uncovered piece of the hull."""
+def _changes(
+    guess: Guess, hull: Bool[np.ndarray, "x y z"], curved: bool, hangs: bool
+) -> Iterator[Change]:
+    """Changes to try: a different kind for a part; a part
+    mirrored with its own or a quarter of its width; a part split in two, each fitted to the hull; a
+    part extended to the floor; supports of a part; a new part around an uncovered piece of
+    the hull."""
     new = len(guess.kinds)
     room = new < MOST_PARTS
     for row in range(new):
@@ -120,11 +125,9 @@ def _changes(guess: Guess, hull: Bool[np.ndarray, "x y z"], curved: bool) -> Ite
                 if single and share < 0.5:
                     yield {row: (BOX, across | bit, one), new: (BOX, across, other)}
         if ends[1, 0] > 0:
-            down = ends.copy()
-            down[1, 0] = 0
-            yield {row: (int(guess.kinds[row]), across, down)}
-        if room and ends[1, 0] >= SHORTEST:
-            yield from ({new: (BOX, across, each)} for across, each in _below(ends))
+            yield _lowered(guess, row)
+        if room and (LEVELS - ends[1, 1] if hangs else ends[1, 0]) >= SHORTEST:
+            yield from ({new: (BOX, *each)} for each in _supports(ends, hangs))
     labels, pieces = ndimage.label(hull & ~_cells_in(guess, len(hull)))
     if not pieces or not room:
         return
@@ -135,9 +138,18 @@ def _changes(guess: Guess, hull: Bool[np.ndarray, "x y z"], curved: bool) -> Ite
             yield {new: (BOX, across, own)}
 
 
-def _below(ends: Int[np.ndarray, "3 2"]) -> Iterator[tuple[int, Int[np.ndarray, "3 2"]]]:
-    """Supports between a part and the floor, each as mirroring and ends: four legs, two side
-    panels, or a front and a back panel."""
+def _supports(
+    ends: Int[np.ndarray, "3 2"], hangs: bool
+) -> Iterator[tuple[int, Int[np.ndarray, "3 2"]]]:
+    """Supports of a part, each as mirroring and ends: four legs, two side panels, or a front and a
+    back panel on the floor; for an object that hangs, a cord from the middle to the ceiling."""
+    if hangs:
+        cord = ends.copy()
+        middle = ends.sum(axis=1) // 2
+        cord[::2] = np.stack([middle - 1, middle + 1], axis=1)[::2]
+        cord[1] = ends[1, 1], LEVELS
+        yield 0, cord
+        return
     under = ends.copy()
     under[1] = 0, ends[1, 0]
     for axes, across in (((0, 2), ACROSS_X | ACROSS_Z), ((0,), ACROSS_X), ((2,), ACROSS_Z)):
@@ -145,6 +157,12 @@ def _below(ends: Int[np.ndarray, "3 2"]) -> Iterator[tuple[int, Int[np.ndarray, 
         for axis in axes:
             leg[axis, 1] = min(leg[axis, 0] + SHORTEST, ends[axis, 1])
         yield across, leg
+
+
+def _with_image(ends: Int[np.ndarray, "2"]) -> tuple[int, int]:
+    """Ends along one axis of the interval around a part and its mirror image."""
+    far = int(max(ends[1], LEVELS - ends[0]))
+    return LEVELS - far, far
 
 
 def _extents_of(
@@ -174,31 +192,71 @@ def _cells_in(guess: Guess, cells: int) -> Bool[np.ndarray, "x y z"]:
 
 
 def _needed(every: RayFit, guess: Guess) -> Guess:
-    """The guess without the parts whose removal lowers the loss."""
+    """The guess without the parts whose removal lowers the loss and breaks nothing."""
     row = 0
     while row < len(guess.kinds) > 1:
         trial = every.without(guess, row)
-        if every.loss(trial) < every.loss(guess):
+        if _faults(every, trial) <= _faults(every, guess) and every.loss(trial) < every.loss(guess):
             guess, row = trial, 0
         else:
             row += 1
     return guess
 
 
-def _joined(every: RayFit, guess: Guess) -> Guess:
-    """The guess with bars that connect its pieces to each other and to the floor or the ceiling,
-    where a bar costs less than the gap. Masks often miss cords, which are thin."""
-    while len(guess.kinds) < MOST_PARTS:
-        new = len(guess.kinds)
-        trials = [
-            every.changed(guess, {new: (BOX, across, bar)})
-            for across, bar in _bars(guess, every.hangs)
-        ]
-        best = min(trials, key=every.loss)
-        if every.loss(best) >= every.loss(guess):
-            break
-        guess = best
+def _closed(every: RayFit, guess: Guess) -> Guess:
+    """The guess without narrow slits between a part and its mirror image, unless rays show them."""
+    for row in range(len(guess.kinds)):
+        for axis, bit in ((0, ACROSS_X), (2, ACROSS_Z)):
+            low, high = guess.ends[row, axis]
+            slit = max(LEVELS - 2 * high, 2 * low - LEVELS)
+            if guess.mirrored[row] & bit and 0 < slit <= SLIT:
+                joined = guess.ends[row].copy()
+                joined[axis] = _with_image(joined[axis])
+                across = int(guess.mirrored[row]) & ~bit
+                trial = every.changed(guess, {row: (int(guess.kinds[row]), across, joined)})
+                if every.loss(trial) < every.loss(guess) + SLIT_LOSS:
+                    guess = trial
     return guess
+
+
+def _whole(every: RayFit, guess: Guess) -> Guess:
+    """The guess as one piece that reaches the floor or, if it hangs, the ceiling, whatever that
+    costs. Masks often miss thin cords and legs, but nothing floats. Each step adds a bar or
+    supports, or removes a part; the cheapest step that mends something is taken."""
+    while faults := _faults(every, guess):
+        new = len(guess.kinds)
+        trials = [every.without(guess, row) for row in range(new) if new > 1]
+        changes = _mends(guess, every.hangs) if new < MOST_PARTS else ()
+        trials += [every.changed(guess, change) for change in changes]
+        mended = [each for each in trials if _faults(every, each) < faults]
+        if not mended:
+            break
+        guess = min(mended, key=every.loss)
+    return guess
+
+
+def _mends(guess: Guess, hangs: bool) -> Iterator[Change]:
+    """Bars and supports, and for an object that stands also parts extended to the floor."""
+    new = len(guess.kinds)
+    yield from ({new: (BOX, *bar)} for bar in _bars(guess, hangs))
+    for row, ends in enumerate(guess.ends):
+        if ends[1, 1] < LEVELS if hangs else ends[1, 0] > 0:
+            yield from ({new: (BOX, *each)} for each in _supports(ends, hangs))
+            if not hangs:
+                yield _lowered(guess, row)
+
+
+def _lowered(guess: Guess, row: int) -> Change:
+    """The change that extends a part to the floor."""
+    down = guess.ends[row].copy()
+    down[1, 0] = 0
+    return {row: (int(guess.kinds[row]), int(guess.mirrored[row]), down)}
+
+
+def _faults(every: RayFit, guess: Guess) -> int:
+    """Number of pieces beyond one, and one more for a gap to the floor or the ceiling."""
+    gap, pieces = every.gap_and_pieces(guess)
+    return pieces - 1 + (gap > 0)
 
 
 def _bars(guess: Guess, hangs: bool) -> Iterator[tuple[int, Int[np.ndarray, "3 2"]]]:
@@ -213,8 +271,7 @@ def _bars(guess: Guess, hangs: bool) -> Iterator[tuple[int, Int[np.ndarray, "3 2
         whole = own.copy()  # with the mirror images
         for bit, axis in ((ACROSS_X, 0), (ACROSS_Z, 2)):
             if across & bit:
-                far = max(own[axis, 1], LEVELS - own[axis, 0])
-                whole[axis] = LEVELS - far, far
+                whole[axis] = _with_image(own[axis])
         ends += [(0, whole)] if across else []
     targets = [*ends, (both, support)]
     for (one, here), (other, there) in itertools.product(ends, targets):

@@ -3,7 +3,8 @@
     half the share of hits that meet no part + half the share of misses that meet one
       + 0.002 (number of parts) + 0.002 (number of planes in which faces lie)
       + 0.002 (number of curved parts) - 0.0005 (volume of the parts, 1 for the box)
-      + 0.06 (gap between the parts and the floor, or the ceiling for lamps; 1 for the box's height)
+      + 0.06 (gap between the largest connected piece and the floor, or the ceiling for lamps;
+              1 for the box's height)
       + 0.005 (connected pieces - 1)
       + 0.1 (overhang of the centre beyond the feet, unless the object hangs; 1 for the box's width)
 
@@ -27,7 +28,7 @@ from jaxtyping import Bool, Float, Int
 
 from sceneprior.core.parts import BOX, SQUARE, Parts
 from sceneprior.lifted.lifting.lifted import RayPool
-from sceneprior.lifted.lifting.outlines import cut_rays, points_within
+from sceneprior.lifted.lifting.outlines import area_table, cut_rays, points_within
 from sceneprior.lifted.lifting.part_prices import (
     LEVELS,
     count_planes,
@@ -94,12 +95,14 @@ class RayFit:
         self.inverse = 1 / self.spans
         self.hits = np.concatenate([hits, np.ones(len(above), bool)])
         self.outline, self.hangs = outline, hangs
+        self.area = area_table(outline, LEVELS)
 
     def loss(self, guess: Guess) -> float:
         """The loss that the module's docstring defines."""
         missed, wrongly_met = wrong_rays(guess.met_by, self.hits)
         volume = sum(map(volume_of, guess.kinds, guess.mirrored, guess.ends))
-        gap, pieces = gap_and_pieces(guess.mirrored, guess.ends, self.hangs)
+        gap, pieces = self.gap_and_pieces(guess)
+        tipping = 0 if self.hangs else overhang(guess.mirrored, guess.ends, self.area)
         return float(
             self.hit_price * missed
             + self.miss_price * wrongly_met
@@ -109,8 +112,13 @@ class RayFit:
             + VOLUME_PRICE * volume
             + GAP_PRICE * gap / LEVELS
             + PIECE_PRICE * (pieces - 1)
-            + (0 if self.hangs else OVERHANG_PRICE * overhang(guess.mirrored, guess.ends) / LEVELS)
+            + OVERHANG_PRICE * tipping / LEVELS
         )
+
+    def gap_and_pieces(self, guess: Guess) -> tuple[int, int]:
+        """Gap in levels to the floor or the ceiling, and number of connected pieces."""
+        gap, pieces = gap_and_pieces(guess.mirrored, guess.ends, self.area, self.hangs)
+        return int(gap), int(pieces)
 
     def guess(
         self,

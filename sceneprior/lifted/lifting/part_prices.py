@@ -1,7 +1,8 @@
 """Terms of the loss that depend on the parts alone: volume, number of planes that contain faces,
 connected pieces, gap to the floor or the ceiling, and overhang (an object that has one tips over).
 
-Faces lie on `LEVELS` + 1 evenly spaced levels between the sides of the object's box.
+Faces lie on `LEVELS` + 1 evenly spaced levels between the sides of the object's box. Parts are cut
+to the object's outline, so what lies outside it closes no gap and supports nothing.
 """
 
 from typing import no_type_check
@@ -64,8 +65,9 @@ def count_planes(ends):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def solids_of(mirrored, ends):
-    """Ends, in levels, of all parts and their mirror images."""
+def solids_of(mirrored, ends, area):
+    """Ends, in levels, of all parts and their mirror images that lie over the outline, whose area
+    table is that of `outlines.area_table`."""
     solids = np.empty((4 * len(ends), 3, 2), np.int64)
     count = 0
     for part in range(len(ends)):
@@ -77,16 +79,20 @@ def solids_of(mirrored, ends):
                 if copy & bit:
                     solids[count, axis, 0] = LEVELS - ends[part, axis, 1]
                     solids[count, axis, 1] = LEVELS - ends[part, axis, 0]
-            count += 1
+            x1, x2 = solids[count, 0]
+            z1, z2 = solids[count, 2]
+            count += area[x2, z2] - area[x1, z2] - area[x2, z1] + area[x1, z1] > 0
     return solids[:count]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def overhang(mirrored, ends):
+def overhang(mirrored, ends, area):
     """Distance in levels, along x plus along z, of the parts' centre of volume from the rectangle
     around the lowest parts. An object with a positive overhang tips over."""
-    solids = solids_of(mirrored, ends)
+    solids = solids_of(mirrored, ends, area)
+    if not len(solids):
+        return 0.0
     lowest = solids[:, 1, 0].min()
     center, volume = np.zeros(3), 0.0
     low, high = np.full(3, float(LEVELS)), np.zeros(3)
@@ -109,10 +115,11 @@ def overhang(mirrored, ends):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def gap_and_pieces(mirrored, ends, hangs):
-    """Gap in levels between the parts and the bottom of the object's box (the top, if the object
-    hangs), and the number of connected pieces. Parts at most one level apart are connected."""
-    solids = solids_of(mirrored, ends)
+def gap_and_pieces(mirrored, ends, area, hangs):
+    """Gap in levels between the largest connected piece and the bottom of the object's box (the
+    top, if the object hangs), and the number of pieces. Parts at most one level apart are
+    connected."""
+    solids = solids_of(mirrored, ends, area)
     count = len(solids)
     piece = np.arange(count)
     pieces = count
@@ -127,7 +134,12 @@ def gap_and_pieces(mirrored, ends, hangs):
                 for each in range(count):
                     if piece[each] == gone:
                         piece[each] = piece[other]
+    volume = np.zeros(count)
+    for solid in range(count):
+        sides = solids[solid, :, 1] - solids[solid, :, 0]
+        volume[piece[solid]] += sides[0] * sides[1] * sides[2]
     gap = LEVELS
     for solid in range(count):
-        gap = min(gap, LEVELS - solids[solid, 1, 1] if hangs else solids[solid, 1, 0])
+        if piece[solid] == volume.argmax():
+            gap = min(gap, LEVELS - solids[solid, 1, 1] if hangs else solids[solid, 1, 0])
     return gap, pieces

@@ -25,10 +25,6 @@ TRIES = 4
 SIZE_RANGE = 0.35
 """Largest difference between the log extents of an object and of its look. The limit is tighter
 than without a request: in a small room, the particles with the smallest objects survive."""
-LOW_M = 0.15
-ON_FLOOR = 0.75
-"""An object is set on the floor if the probability that its bottom is below `LOW_M` exceeds this
-value. Otherwise, in a small room, particles with a bed in mid-air would survive."""
 
 Rejections = Counter[tuple[int, str]]
 """Number of places rejected for an object, by its class and the reason."""
@@ -64,7 +60,7 @@ def place_next(
         hanging: Indices of the classes that hang from a ceiling of known height.
         rejections: Counts to which rejected places are added.
     """
-    chance = np.concatenate([each.random((PARTICLES, 7 + 4 * TRIES)) for each in draws])
+    chance = np.concatenate([each.random((PARTICLES, 6 + 4 * TRIES)) for each in draws])
     going = particles.alive & (particles.upcoming[:, step] != 0).numpy()
     rows = torch.from_numpy(np.flatnonzero(going))
     if not len(rows):
@@ -103,13 +99,9 @@ def _propose(
     reading = particles.read(sampler, rows, step)
     numbers = torch.from_numpy(chance)[rows].float()
     look = draw_index(sampler.look_logits(reading, label), numbers[:, 0])
-    mixture = sampler.details(reading, label, look)
-    details = mixture.draw(numbers[:, 1], numbers[:, 2:6])
-    off = details[:, :3].clamp(-SIZE_RANGE, SIZE_RANGE)
-    size_m = (sampler.look_shown[look, -3:] + off).exp()
-    low = mixture.weight_logits.softmax(dim=-1) * (mixture.means[..., 3] < LOW_M)
-    on_floor = (low.sum(dim=-1) > ON_FLOOR) & (details[:, 3] > LOW_M)
-    bottom_m = details[:, 3].clamp(min=0).masked_fill(on_floor, 0.0)
+    off = sampler.extents(reading, label, look).draw(numbers[:, 1], numbers[:, 2:5])
+    size_m = (sampler.look_shown[look, -3:] + off.clamp(-SIZE_RANGE, SIZE_RANGE)).exp()
+    bottom_m = sampler.bottom_m(look, size_m)
     shapes = [particles.plan(row).shape for row in rows.tolist()]
     for at, shape in enumerate(shapes):
         if shape.ceiling_m is not None:
@@ -117,7 +109,7 @@ def _propose(
             hangs = int(label[at]) in hanging
             bottom_m[at] = highest_m if hangs else min(float(bottom_m[at]), highest_m)
     rectangle_m = torch.stack([
-        torch.from_numpy(_rectangle(shape.rectangles_m, size_m[at, ::2].numpy(), chance[row, 6]))
+        torch.from_numpy(_rectangle(shape.rectangles_m, size_m[at, ::2].numpy(), chance[row, 5]))
         for at, (row, shape) in enumerate(zip(rows.tolist(), shapes, strict=True))
     ]).float()  # fmt: skip
     reading = reading._replace(frame=Frame.plain(rectangle_m))
@@ -147,7 +139,7 @@ def _draw_places(
 ) -> list[int]:
     """Place each object at the first allowed place of `TRIES` drawn ones, and return the rows of
     `found` without one."""
-    numbers = torch.from_numpy(chance[found.rows.numpy(), 7:]).float().unflatten(1, (TRIES, 4))
+    numbers = torch.from_numpy(chance[found.rows.numpy(), 6:]).float().unflatten(1, (TRIES, 4))
     x = found.places.draw_x(numbers[..., :2])
     waiting = torch.arange(len(found.rows))
     for number in range(TRIES):

@@ -74,7 +74,7 @@ def draw_rooms(
         # The very last attempt is by itself, because it places objects in another way.
         until = min(number + _attempts(len(waiting)), ROUNDS * (number // ROUNDS + 1), last)
         attempts = range(number, max(until, number + 1))
-        each = (count, slots * (5 + 4 * PLACES))
+        each = (count, slots * (3 + 4 * PLACES))
         numbers = torch.stack([uniform_numbers(*each, (seed, PLANS + at)) for at in attempts])
         numbers = numbers.unflatten(2, (slots, -1))
         rectangle_m[waiting] = plan.rectangle_m[waiting]
@@ -175,10 +175,9 @@ def _placed(
     """
     look = draw_index(sampler.look_logits(reading, label), chance[:, 1])
     size_m = sampler.draw_size(look, chance[:, 2])
-    bottoms = sampler.bottom(reading, label, look, size_m)
-    bottom_m = bottoms.draw(chance[:, 3], chance[:, 4:5])[:, 0].clamp(min=0)  # not below the floor
+    bottom_m = sampler.bottom_m(look, size_m)
     places = sampler.place(reading, label, look, size_m, bottom_m)
-    numbers = chance[:, 5:].unflatten(1, (PLACES, 4))[:, :tries]
+    numbers = chance[:, 3:].unflatten(1, (PLACES, 4))[:, :tries]
     x = places.draw_x(numbers[..., :2])
     centre_m = torch.stack([x[:, 0], bottom_m + size_m[:, 1] / 2, x[:, 0]], dim=-1)
     boxes_m = torch.cat([centre_m, size_m], dim=-1)

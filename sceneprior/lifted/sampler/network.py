@@ -24,8 +24,8 @@ CLASS_WIDTH = 32
 """Dimension of the class embedding."""
 RECTANGLES = 6
 """Components of the Gaussian mixture of the rectangle around a room's furniture."""
-DETAILS = 4
-"""Components of the logistic mixture of an object's size and height."""
+EXTENTS = 4
+"""Components of the logistic mixture of an object's extents."""
 MATCH_WIDTH = 64
 """Dimension of the query and the keys by which looks are compared."""
 
@@ -71,6 +71,7 @@ class RoomSampler(nn.Module):
     fronts: Tensor
     front_confidence: Tensor
     sizes_m: Tensor
+    bottoms_m: Tensor
     size_counts: Tensor
 
     def __init__(self, settings: SamplerConfig, classes: int, prototypes: int, max_objects: int):
@@ -90,6 +91,7 @@ class RoomSampler(nn.Module):
         self.register_buffer("fronts", torch.zeros(prototypes, dtype=torch.int64))
         self.register_buffer("front_confidence", torch.zeros(prototypes))
         self.register_buffer("sizes_m", torch.ones(prototypes, SIZES, 3))
+        self.register_buffer("bottoms_m", torch.zeros(prototypes, SIZES))
         self.register_buffer("size_counts", torch.zeros(prototypes, SIZES))
         # Contents and places overfit first: they get twice the dropout, at most 0.5.
         self.contents = Contents(classes, width // 2, min(2 * dropout, 0.5))
@@ -111,7 +113,7 @@ class RoomSampler(nn.Module):
         self.wanted_look = _head(known, width, MATCH_WIDTH)
         self.offered_look = _head(SHOWN, width, MATCH_WIDTH)
         self.frequency = nn.Parameter(torch.zeros(prototypes, POSES))
-        self.details_head = _head(known + width, width, DETAILS * 9)
+        self.extents_head = _head(known + width, width, EXTENTS * 7)
         self.placement = Placement(classes, min(2 * dropout, 0.5))
 
     @property
@@ -195,12 +197,11 @@ class RoomSampler(nn.Module):
         others = self.look_class[: self.looks] != label.unsqueeze(-1)
         return logits.masked_fill(others, -torch.inf)
 
-    def details(
+    def extents(
         self, reading: Reading, label: Int[Tensor, " rooms"], look: Int[Tensor, " rooms"]
     ) -> LogisticMixture:
-        """Joint distribution of the object's log extents, relative to those of its look, and of the
-        height of its bottom."""
-        return LogisticMixture.of(self.details_head(self._known(reading, label, look)), 4)
+        """Distribution of the object's log extents, relative to those of its look."""
+        return LogisticMixture.of(self.extents_head(self._known(reading, label, look)), 3)
 
     def draw_size(
         self, look: Int[Tensor, " rooms"], uniform: Float[Tensor, " rooms"]
@@ -209,19 +210,18 @@ class RoomSampler(nn.Module):
         objects with them (`find_sizes`)."""
         prototype = look // POSES
         which = draw_index(self.size_counts[prototype].log(), uniform)
-        size_m = self.sizes_m[prototype, which]
-        return size_m.flip(-1).where(look.unsqueeze(-1) % 2 == 1, size_m)
+        return _swapped(look, self.sizes_m[prototype, which])
 
-    def bottom(
-        self,
-        reading: Reading,
-        label: Int[Tensor, " rooms"],
-        look: Int[Tensor, " rooms"],
-        size_m: Float[Tensor, "rooms 3"],
-    ) -> LogisticMixture:
-        """Distribution of the height of the object's bottom, given its size."""
-        off = size_m.log() - self.look_shown[look, -3:]
-        return self.details(reading, label, look).given(off)
+    def bottom_m(
+        self, look: Int[Tensor, " rooms"], size_m: Float[Tensor, "rooms 3"]
+    ) -> Float[Tensor, " rooms"]:
+        """Height of the bottom of objects: that of the training objects with the same prototype and
+        the most similar extents. Heights repeat as sizes do: furniture stands, and lamps hang from
+        the same ceiling."""
+        prototype = look // POSES
+        off = (_swapped(look, size_m).log().unsqueeze(1) - self.sizes_m[prototype].log()).abs()
+        off = off.sum(dim=-1).masked_fill(self.size_counts[prototype] == 0, torch.inf)
+        return self.bottoms_m[prototype].gather(1, off.argmin(dim=1, keepdim=True))[:, 0]
 
     def place(
         self,
@@ -250,13 +250,11 @@ class RoomSampler(nn.Module):
         centre_m, size_m = coming.boxes_m[:, 0].split(3, dim=-1)
         bottom_m = centre_m[:, 1] - size_m[:, 1] / 2
         looks = self.look_logits(reading, label).log_softmax(dim=-1)
-        details = torch.cat(
-            [size_m.log() - self.look_shown[look, -3:], bottom_m.unsqueeze(-1)], dim=-1
-        )
+        extents = size_m.log() - self.look_shown[look, -3:]
         place = self.place(reading, label, look, size_m, bottom_m)
         return {
             "look": looks.gather(-1, look.unsqueeze(-1))[:, 0],
-            "size": self.details(reading, label, look).log_prob(details),
+            "size": self.extents(reading, label, look).log_prob(extents),
             "place": place.log_prob(centre_m[:, ::2]),
         }
 
@@ -265,6 +263,14 @@ class RoomSampler(nn.Module):
     ) -> Float[Tensor, "rooms known"]:
         look_seen = self.look_embedding(self.look_shown[look])
         return torch.cat([reading.context, self.class_embedding(label), look_seen], dim=-1)
+
+
+def _swapped(
+    look: Int[Tensor, " rooms"], size_m: Float[Tensor, "rooms 3"]
+) -> Float[Tensor, "rooms 3"]:
+    """Extents in the pose of a look from those in pose 0, or the reverse: odd poses are turned by a
+    quarter or three."""
+    return size_m.flip(-1).where(look.unsqueeze(-1) % 2 == 1, size_m)
 
 
 def _head(inputs: int, width: int, outputs: int) -> nn.Sequential:

@@ -1,8 +1,9 @@
-"""Sizes that repeat: clusters of the training objects' extents, for each prototype.
+"""Sizes and heights that repeat: clusters of training objects, for each prototype.
 
 Real furniture repeats a limited number of models, and lifted boxes of the same model differ by a
-few per cent. Objects of one prototype with similar extents are one entry, with their median extents
-and their number. An entry holds only a size, and nothing about the rooms in which it was found.
+few per cent. Objects of one prototype with similar extents are one entry, with their median
+extents, the median height of their bottoms, and their number. An entry holds nothing about the
+rooms in which its objects were found.
 """
 
 import numpy as np
@@ -26,12 +27,15 @@ unusual size is more often an error of lifting than truly rare."""
 
 def find_sizes(
     rooms: RoomBoxes, prototypes: Prototypes, count: int
-) -> tuple[Float[Tensor, "count sizes 3"], Float[Tensor, "count sizes"]]:
-    """Extents of the entries of each prototype, in pose 0, in metres, and their numbers of objects.
+) -> tuple[
+    Float[Tensor, "count sizes 3"], Float[Tensor, "count sizes"], Float[Tensor, "count sizes"]
+]:
+    """Extents of the entries of each prototype, in pose 0, heights of their bottoms, at least 0,
+    both in metres, and their numbers of objects.
 
     Entries are clusters by complete linkage of the objects' log extents, cut at `SAME_SIZE`. A
-    prototype without objects has one entry, its own extents. Unused rows have extents of 1 m and
-    the number 0.
+    prototype without objects has one entry, its own extents on the floor. Unused rows have extents
+    of 1 m and the number 0.
 
     Args:
         rooms: Furnished rooms with looks.
@@ -42,14 +46,18 @@ def find_sizes(
 
     assert rooms.looks is not None
     looks = rooms.looks[rooms.is_object].numpy()
-    objects_m = rooms.boxes_m[rooms.is_object][:, 3:].numpy().astype(np.float64)
+    centers_m, objects_m = rooms.boxes_m[rooms.is_object].double().split(3, dim=-1)
+    heights_m = (centers_m - objects_m / 2)[:, 1].clamp(min=0).numpy()
     # Odd poses are turned by a quarter or three, which swaps x and z.
-    objects_m = np.where(looks[:, None] % 2 == 1, objects_m[:, ::-1], objects_m)
-    found_m, numbers = torch.ones(count, SIZES, 3), torch.zeros(count, SIZES)
+    objects_m = np.where(looks[:, None] % 2 == 1, objects_m.numpy()[:, ::-1], objects_m)
+    found_m = torch.ones(count, SIZES, 3)
+    bottoms_m, numbers = torch.zeros(2, count, SIZES)
     for row in np.flatnonzero(prototypes.object_class >= 0):
-        own_m = objects_m[looks // POSES == row]
+        own = looks // POSES == row
+        own_m, own_bottoms_m = objects_m[own], heights_m[own]
         if len(own_m) < 2:
-            own_m = own_m if len(own_m) else prototypes.sizes_m[row, None]
+            if not len(own_m):
+                own_m, own_bottoms_m = prototypes.sizes_m[row, None], np.zeros(1)
             entry = np.zeros(1, dtype=int)
         else:
             joined = linkage(np.log(own_m), "complete", "chebyshev")
@@ -59,5 +67,7 @@ def find_sizes(
         kept = kept[number[kept] >= min(COMMON, number.max())]
         medians_m = [np.median(own_m[entry == each], axis=0) for each in kept]
         found_m[row, : len(kept)] = torch.from_numpy(np.stack(medians_m))
+        for column, each in enumerate(kept):
+            bottoms_m[row, column] = float(np.median(own_bottoms_m[entry == each]))
         numbers[row, : len(kept)] = torch.from_numpy(number[kept])
-    return found_m, numbers
+    return found_m, bottoms_m, numbers

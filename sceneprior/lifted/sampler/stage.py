@@ -145,7 +145,7 @@ class SamplerStage(lightning.LightningModule):
 def teach(sampler: RoomSampler, rooms: SamplerRooms) -> None:
     """Set the buffers of a fresh sampler from the training rooms: the encodings of looks, the
     mixture of rectangles, the classes that may be sampled, the pairs of classes that may intersect,
-    mean footprints, and the sizes, backs and fronts of prototypes."""
+    mean footprints, and the sizes, heights, backs and fronts of prototypes."""
     prototypes = rooms.prototypes
     looks = torch.from_numpy(prototypes.shown())
     sampler.look_shown[: len(looks)] = looks
@@ -158,9 +158,11 @@ def teach(sampler: RoomSampler, rooms: SamplerRooms) -> None:
     areas_m2 = rooms.rooms.boxes_m[here][:, [3, 5]].prod(dim=-1)
     labels = rooms.rooms.object_class[here]
     sampler.footprints_m2.scatter_reduce_(0, labels, areas_m2, "mean", include_self=False)
-    sizes_m, numbers = find_sizes(rooms.rooms, prototypes, len(sampler.backs))
-    sampler.sizes_m.copy_(sizes_m)
-    sampler.size_counts.copy_(numbers)
+    found = find_sizes(rooms.rooms, prototypes, len(sampler.backs))
+    for buffer, values in zip(
+        (sampler.sizes_m, sampler.bottoms_m, sampler.size_counts), found, strict=True
+    ):
+        buffer.copy_(values)
     sampler.backs.copy_(find_backs(rooms.rooms, len(sampler.backs)))
     fronts, confidence = find_fronts(rooms.rooms, prototypes, len(sampler.fronts))
     sampler.fronts.copy_(fronts)
@@ -169,12 +171,12 @@ def teach(sampler: RoomSampler, rooms: SamplerRooms) -> None:
     furnished = here.any(dim=1)
     frames = torch.cat([frames_of(rooms.rooms, generator) for _ in range(FRAMES)])
     centre, extents = frames[furnished.repeat(FRAMES)].split(2, dim=-1)
-    found = GaussianMixture(RECTANGLES, reg_covar=LEAST_VARIANCE, random_state=0).fit(
+    mixture = GaussianMixture(RECTANGLES, reg_covar=LEAST_VARIANCE, random_state=0).fit(
         torch.cat([centre, extents.log()], dim=-1).numpy()
     )
     for buffer, values in (
-        (sampler.rectangle_logits, np.log(found.weights_)),
-        (sampler.rectangle_means, found.means_),
-        (sampler.rectangle_factors, np.linalg.cholesky(found.covariances_)),
+        (sampler.rectangle_logits, np.log(mixture.weights_)),
+        (sampler.rectangle_means, mixture.means_),
+        (sampler.rectangle_factors, np.linalg.cholesky(mixture.covariances_)),
     ):
         buffer.copy_(torch.from_numpy(values))

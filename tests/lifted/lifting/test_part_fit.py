@@ -6,11 +6,20 @@ import trimesh
 from parts_of_rooms import CORNER, TABLE, boxes, rays_of
 
 from sceneprior.core.geometry.part_meshes import surface_of_parts
-from sceneprior.core.parts import BOX, CYLINDER, MOST_CORNERS, MOST_PARTS, Parts, filled_cells
+from sceneprior.core.parts import (
+    ACROSS_X,
+    BOX,
+    CYLINDER,
+    MOST_CORNERS,
+    MOST_PARTS,
+    Parts,
+    filled_cells,
+)
 from sceneprior.lifted.lifting.lifted import RayPool
-from sceneprior.lifted.lifting.part_fit import _below, fit_parts
+from sceneprior.lifted.lifting.outlines import area_table
+from sceneprior.lifted.lifting.part_fit import _closed, _supports, fit_parts
 from sceneprior.lifted.lifting.part_loss import RayFit
-from sceneprior.lifted.lifting.part_prices import overhang
+from sceneprior.lifted.lifting.part_prices import gap_and_pieces, overhang
 
 MARGIN, CELLS = 1.1, 32
 
@@ -51,6 +60,43 @@ def test_what_hangs_reaches_the_ceiling_and_what_stands_the_floor():
         found = fit_parts(rays_of(shade, 4000), hull, MARGIN, hangs)
         heights = np.stack([ends[1] for _, ends in found.solids()])
         assert heights.max() == 0.5 if hangs else heights.min() == -0.5
+        assert pieces_of(found, hangs) == (0, 1)
+
+
+def pieces_of(found: Parts, hangs: bool) -> tuple[int, int]:
+    levels = np.rint((found.ends + 0.5) * 64).astype(np.int64)
+    return gap_and_pieces(found.mirrored, levels, area_table(found.outline, 64), hangs)
+
+
+def test_nothing_floats():
+    """Masks show two mattresses of a bunk bed, but no posts; a lamp and its cap, but no cord."""
+    bunks = boxes((0, 64, 8, 20, 0, 64), (0, 64, 48, 64, 0, 64))
+    hull = filled_cells(bunks, CELLS, MARGIN)
+    found = fit_parts(rays_of(bunks, 4000), hull, MARGIN)
+    assert pieces_of(found, False) == (0, 1)
+    filled = filled_cells(found, 64, 1.0)
+    assert filled[:, 14].mean() > 0.9 and filled[:, 34].mean() < 0.05, "posts, not a block"
+    lamp = boxes((0, 64, 0, 20, 0, 64), (24, 40, 60, 64, 24, 40))
+    found = fit_parts(rays_of(lamp, 4000), filled_cells(lamp, CELLS, MARGIN), MARGIN, hangs=True)
+    assert pieces_of(found, True) == (0, 1)
+    assert filled_cells(found, 64, 1.0)[:, 30].sum() <= 64, "a thin cord"
+
+
+def test_a_narrow_slit_between_a_part_and_its_image_is_closed_unless_rays_pass_it():
+    halves = Parts(
+        np.array([BOX]), np.array([ACROSS_X]),
+        np.array([[[-0.5, -0.03125], [-0.5, 0.5], [-0.5, 0.5]]]),
+    )  # fmt: skip
+    ends = np.rint((halves.ends + 0.5) * 64).astype(np.int64)
+    for count, closed in ((0, True), (4000, False)):
+        rays = rays_of(halves, 4000)
+        rays = RayPool(*(part[: max(count, 40)] for part in rays))
+        if not count:
+            rays = rays._replace(hits=np.ones(40, bool))
+        fit = RayFit(rays, MARGIN)
+        found = _closed(fit, fit.guess(halves.kind, halves.mirrored, ends))
+        assert (found.mirrored[0] == 0) == closed
+        assert found.ends[0, 0].tolist() == ([0, 64] if closed else [0, 30])
 
 
 def test_furniture_that_stands_does_not_tip_over():
@@ -61,7 +107,7 @@ def test_furniture_that_stands_does_not_tip_over():
     for hangs in (False, True):
         found = fit_parts(rays_of(shown, 4000), hull, MARGIN, hangs)
         levels = np.rint((found.ends + 0.5) * 64).astype(np.int64)
-        legs.append(overhang(found.mirrored, levels))
+        legs.append(overhang(found.mirrored, levels, area_table(found.outline, 64)))
     assert legs[0] < 4 < legs[1]
 
 
@@ -128,6 +174,6 @@ def test_a_round_bench_keeps_its_outline():
 def test_what_stands_below_a_part_is_no_wider(first):
     """Compiled code checks no index: an end beyond the last level would be read from elsewhere."""
     ends = np.array([[first, first + 2], [20, 40], [first, first + 2]])
-    for _, below in _below(ends):
+    for _, below in _supports(ends, hangs=False):
         assert (below[[0, 2], 0] >= first).all() and (below[[0, 2], 1] <= first + 2).all()
         assert (below[:, 0] < below[:, 1]).all() and below[1].tolist() == [0, 20]

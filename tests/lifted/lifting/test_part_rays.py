@@ -5,6 +5,7 @@ import pytest
 from parts_of_rooms import TABLE, rays_of
 
 from sceneprior.core.parts import ACROSS_X, ACROSS_Z, BOX, SQUARE, Parts, inside
+from sceneprior.lifted.lifting.outlines import area_table
 from sceneprior.lifted.lifting.part_loss import RayFit
 from sceneprior.lifted.lifting.part_prices import (
     LEVELS,
@@ -17,6 +18,7 @@ from sceneprior.lifted.lifting.part_prices import (
 from sceneprior.lifted.lifting.part_rays import count_wrong, descend, meets
 
 MARGIN = 1.1
+EVERYWHERE = area_table(SQUARE, LEVELS)
 
 
 @pytest.mark.parametrize("kind", range(5))
@@ -101,27 +103,43 @@ def test_gaps_are_those_to_the_floor_or_the_ceiling():
     legs = np.array([[[0, 8], [0, 40], [0, 8]]])
     top = np.array([[[0, 64], [41, 60], [0, 64]]])
     both = np.concatenate([legs, top])
-    assert gap_and_pieces(np.array([3, 0]), both, False) == (0, 1), "within a level"
-    assert gap_and_pieces(np.array([3, 0]), both, True) == (4, 1)
+    assert gap_and_pieces(np.array([3, 0]), both, EVERYWHERE, False) == (0, 1), "within a level"
+    assert gap_and_pieces(np.array([3, 0]), both, EVERYWHERE, True) == (4, 1)
     top[0, 1, 0] = 42
     apart = np.concatenate([legs, top])
-    assert gap_and_pieces(np.array([3, 0]), apart, False) == (0, 5)
-    assert gap_and_pieces(np.zeros(1, int), top, False) == (42, 1)
+    for hangs, gap in ((False, 42), (True, 4)):
+        found = gap_and_pieces(np.array([3, 0]), apart, EVERYWHERE, hangs)
+        assert found == (gap, 5), "the gap is that of the largest piece"
+    assert gap_and_pieces(np.zeros(1, int), top, EVERYWHERE, False) == (42, 1)
+
+
+def test_what_lies_outside_the_outline_supports_nothing():
+    """A triangle without the corner at high x and z, in which one of four legs stands."""
+    legs = np.array([[[0, 8], [0, 40], [0, 8]], [[0, 64], [40, 64], [0, 64]]])
+    area = area_table(np.array([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5]]), 64)
+    assert area[-1, -1] == pytest.approx(64 * 64 / 2, rel=0.02)
+    assert area[8, 8] == 64 and area[20, 4] == 80
+    assert gap_and_pieces(np.array([3, 0]), legs, area, False) == (0, 1)
+    far = legs[:1] + np.array([[56], [0], [56]])
+    assert gap_and_pieces(np.zeros(1, int), far, area, False) == (64, 0)
+    both = np.concatenate([far, legs[1:]])
+    assert gap_and_pieces(np.zeros(2, int), both, area, False) == (40, 1)
+    assert overhang(np.zeros(1, int), far, area) == 0
 
 
 def test_a_table_on_one_leg_would_tip_over():
     top = [[0, 64], [56, 64], [0, 64]]
     leg = [[0, 8], [0, 56], [0, 8]]
     ends = np.array([top, leg])
-    assert overhang(np.array([0, ACROSS_X | ACROSS_Z]), ends) == 0
+    assert overhang(np.array([0, ACROSS_X | ACROSS_Z]), ends, EVERYWHERE) == 0
     volumes = np.array([8 * 64 * 64, 8 * 8 * 56])
     middle = (volumes * [32, 4]).sum() / volumes.sum()
-    assert overhang(np.array([0, 0]), ends) == pytest.approx(2 * (middle - 8))
-    assert overhang(np.array([0, ACROSS_Z]), ends) == pytest.approx(
+    assert overhang(np.array([0, 0]), ends, EVERYWHERE) == pytest.approx(2 * (middle - 8))
+    assert overhang(np.array([0, ACROSS_Z]), ends, EVERYWHERE) == pytest.approx(
         (np.array([volumes[0], 2 * volumes[1]]) * [32, 4]).sum() / (volumes[0] + 2 * volumes[1]) - 8
     )
     ends[1, [0, 2]] = 28, 36  # a pedestal
-    assert overhang(np.array([0, 0]), ends) == 0
+    assert overhang(np.array([0, 0]), ends, EVERYWHERE) == 0
 
 
 def test_wrong_rays_of_several_objects_are_counted_at_once():

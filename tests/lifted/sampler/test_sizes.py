@@ -1,4 +1,4 @@
-"""Sizes that repeat: clusters found by a plain loop, and draws in proportion to their numbers."""
+"""Sizes and heights that repeat: clusters found by a plain loop, draws in proportion to numbers."""
 
 from dataclasses import replace
 from itertools import combinations
@@ -46,12 +46,15 @@ def complete_linkage(own_m: list[np.ndarray]) -> list[list[np.ndarray]]:
 
 
 def test_entries_are_those_of_a_plain_loop(rooms):
-    found_m, numbers = find_sizes(rooms.rooms, rooms.prototypes, PROTOTYPES)
+    found_m, bottoms_m, numbers = find_sizes(rooms.rooms, rooms.prototypes, PROTOTYPES)
     own: dict[int, list[np.ndarray]] = {}
+    heights_m: dict[tuple, float] = {}
     for room, item in rooms.rooms.is_object.nonzero().tolist():
         prototype, pose = divmod(int(rooms.rooms.looks[room, item]), POSES)
         size_m = rooms.rooms.boxes_m[room, item, 3:].double().numpy()
         own.setdefault(prototype, []).append(size_m[::-1] if pose % 2 else size_m)
+        height_m = float(rooms.rooms.boxes_m[room, item, 1]) - size_m[1] / 2
+        heights_m[tuple(own[prototype][-1])] = max(height_m, 0.0)
     assert max(map(len, own.values())) > 20
     for prototype, each in own.items():
         clusters = [one for one in complete_linkage(each) if len(one) >= COMMON]
@@ -60,14 +63,21 @@ def test_entries_are_those_of_a_plain_loop(rooms):
         rows_m = found_m[prototype, used].double().numpy().round(5)
         found = dict(zip(map(tuple, rows_m), numbers[prototype, used].tolist(), strict=True))
         assert len(found) > 1
+        low_m = {
+            tuple(np.median(one, axis=0).round(5)): np.median([heights_m[tuple(e)] for e in one])
+            for one in clusters
+        }
+        for row_m, bottom_m in zip(rows_m, bottoms_m[prototype, used].tolist(), strict=True):
+            nearest = min(low_m, key=lambda each: np.abs(np.array(each) - row_m).max())
+            assert bottom_m == pytest.approx(low_m[nearest], abs=1e-5)
         assert sorted(found.values()) == sorted(wanted.values())
         assert_close(np.array(sorted(found)), np.array(sorted(wanted)), atol=2e-5, rtol=0)
 
 
 def test_the_most_frequent_are_kept(rooms, monkeypatch):
-    _, every = find_sizes(rooms.rooms, rooms.prototypes, PROTOTYPES)
+    *_, every = find_sizes(rooms.rooms, rooms.prototypes, PROTOTYPES)
     monkeypatch.setattr(module, "SIZES", 2)
-    _, few = find_sizes(rooms.rooms, rooms.prototypes, PROTOTYPES)
+    *_, few = find_sizes(rooms.rooms, rooms.prototypes, PROTOTYPES)
     assert torch.equal(few, every[:, :2])
     assert (every.diff(dim=1) <= 0).all()
 
@@ -82,14 +92,14 @@ def test_a_room_turned_or_mirrored_teaches_the_same_sizes(rooms):
 def test_a_prototype_with_one_object_or_none_has_one_size():
     rooms = sampler_rooms()
     alone = rooms.rooms.only(torch.arange(len(rooms))[:, None] == 1)
-    found_m, numbers = find_sizes(alone, rooms.prototypes, PROTOTYPES)
+    found_m, _, numbers = find_sizes(alone, rooms.prototypes, PROTOTYPES)
     none = rooms.rooms.only(torch.zeros(len(rooms), 1, dtype=torch.bool))
-    own_m, ones = find_sizes(none, rooms.prototypes, PROTOTYPES)
+    own_m, floor_m, ones = find_sizes(none, rooms.prototypes, PROTOTYPES)
     used = len(rooms.prototypes.sizes_m)
     assert_close(own_m[:used, 0], torch.from_numpy(rooms.prototypes.sizes_m).float())
     wanted = torch.zeros(PROTOTYPES, SIZES)
     wanted[:used, 0] = 1
-    assert torch.equal(ones, wanted) and torch.equal(numbers, wanted)
+    assert not floor_m.any() and torch.equal(ones, wanted) and torch.equal(numbers, wanted)
     first = int(alone.looks[1, 0])
     assert_close(found_m[first // POSES, 0].sort().values, alone.boxes_m[1, 0, 3:].sort().values)
 
@@ -107,10 +117,25 @@ def test_sizes_are_drawn_as_often_as_they_occur_in_the_pose_of_the_look():
 
 def test_drawn_rooms_hold_sizes_of_the_training_rooms_alone():
     sampler = small_sampler(sampler_rooms())
+    sampler.bottoms_m.copy_(torch.rand(sampler.bottoms_m.shape) * sampler.size_counts.sign())
     drawn = draw_rooms(sampler, 30, 0)
     assert drawn.is_object.any()
-    for look, size_m in zip(
-        drawn.looks[drawn.is_object], drawn.boxes_m[drawn.is_object][:, 3:], strict=True
+    for look, box_m in zip(
+        drawn.looks[drawn.is_object], drawn.boxes_m[drawn.is_object], strict=True
     ):
+        size_m = box_m[3:]
         own_m = size_m.flip(0) if look % 2 else size_m
-        assert (sampler.sizes_m[look // POSES] == own_m).all(dim=-1).any()
+        same = (sampler.sizes_m[look // POSES] == own_m).all(dim=-1)
+        assert same.any()
+        assert_close(sampler.bottoms_m[look // POSES][same][0], box_m[1] - size_m[1] / 2)
+
+
+def test_the_height_is_that_of_the_most_similar_size():
+    sampler = small_sampler(sampler_rooms())
+    sampler.sizes_m[0, :2] = torch.tensor([[2.0, 0.8, 1.4], [1.0, 0.5, 0.6]])
+    sampler.bottoms_m[0, :2] = torch.tensor([0.0, 2.2])
+    sampler.size_counts[0] = torch.eye(SIZES)[:2].sum(dim=0)
+    asked_m = torch.tensor([[1.9, 0.8, 1.3], [0.9, 0.6, 0.6], [0.6, 0.6, 1.1], [1.0, 1.0, 1.0]])
+    # The last size is like the unused rows, which are no entries.
+    found_m = sampler.bottom_m(torch.tensor([0, 2, 1, 0]), asked_m)
+    assert torch.equal(found_m, torch.tensor([0.0, 2.2, 2.2, 2.2]))
