@@ -15,6 +15,7 @@ from sceneprior.lifted.sampler.contents import Contents
 from sceneprior.lifted.sampler.placement import SHOWN, Placement
 from sceneprior.lifted.sampler.places import Places
 from sceneprior.lifted.sampler.reading import LENGTHS, Frame, Reading, lengths_shown
+from sceneprior.lifted.sampler.relatives import Relatives
 from sceneprior.lifted.sampler.rooms import SYMMETRIES, gaps_m, rectangle_sides
 from sceneprior.lifted.sampler.settings import SamplerConfig
 from sceneprior.lifted.sampler.sizes import SIZES
@@ -111,6 +112,7 @@ class RoomSampler(nn.Module):
         self.wanted_look = _head(known, width, MATCH_WIDTH)
         self.offered_look = _head(SHOWN, width, MATCH_WIDTH)
         self.frequency = nn.Parameter(torch.zeros(prototypes, POSES))
+        self.relatives = Relatives(classes)
         self.details_head = _head(known + width, width, DETAILS * 9)
         self.placement = Placement(classes, min(2 * dropout, 0.5))
 
@@ -192,6 +194,7 @@ class RoomSampler(nn.Module):
         own_pose = OWN_POSE.to(self.frequency.device)
         frequency = self.frequency[:, own_pose].transpose(0, 1).flatten(1)[:, : self.looks]
         logits = logits + frequency[reading.frame.symmetry]
+        logits = logits + self.relatives(label, reading.before, self.backs, self.looks)
         others = self.look_class[: self.looks] != label.unsqueeze(-1)
         return logits.masked_fill(others, -torch.inf)
 
