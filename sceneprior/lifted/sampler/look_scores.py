@@ -1,4 +1,4 @@
-"""Scores of the next object's look by the other furniture of its room: direction, shape and size."""
+"""Scores of the next object's look by the other furniture: direction, shape and size."""
 
 import torch
 from jaxtyping import Float, Int
