@@ -11,10 +11,10 @@ from sceneprior.lifted.prototypes import POSES
 from sceneprior.lifted.sampler.contents import MANY
 from sceneprior.lifted.sampler.frames import side_of
 
-RELATIONS = 5
+RELATIONS = 4
 """Number of features of the relation of a direction to an object already placed: its back points
-in the same direction, in the opposite one, or sideways; the logarithm of the ratio of its extents,
-along the direction to across it; and the absolute value of this logarithm."""
+in the same direction, in the opposite one, or sideways; and the logarithm of the ratio of its
+extents, along the direction to across it."""
 MOST_LOG = 1.0
 """Bound of this logarithm."""
 MEASURES = 2
@@ -75,7 +75,7 @@ class LookScores(nn.Module):
         extents = before.boxes_m[..., [3, 5]].where(before.is_object.unsqueeze(-1), 1.0)
         along_x = (extents[..., :1].log() - extents[..., 1:].log()).clamp(-MOST_LOG, MOST_LOG)
         along = torch.where(sides % 2 == 1, along_x, -along_x)
-        features = torch.stack([turned == 0, turned == 2, turned % 2 == 1, along, along.abs()], -1)
+        features = torch.stack([turned == 0, turned == 2, turned % 2 == 1, along], -1)
         table = self.direction_table[label.unsqueeze(1), before.object_class]
         table = table * before.is_object.unsqueeze(-1)
         return torch.einsum("rosf,rof->rs", features.to(table), table)

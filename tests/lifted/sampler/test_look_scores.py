@@ -75,8 +75,7 @@ def test_scores_are_those_of_a_plain_loop(scores, rooms):
                 total += table[{0: 0, 1: 2, 2: 1, 3: 2}[turn]]
                 x, z = rooms.boxes_m[row, item, [3, 5]].tolist()
                 ratio = math.log(z / x) if side in (0, 2) else math.log(x / z)
-                ratio = max(-MOST_LOG, min(MOST_LOG, ratio))
-                total += table[3] * ratio + table[4] * abs(ratio)
+                total += table[3] * max(-MOST_LOG, min(MOST_LOG, ratio))
                 repeats |= other == label and int(known) // POSES == look // POSES
             total += float(scores.repeat_table[label]) * repeats
             x, _, z = look_shown()[look, -3:].tolist()
