@@ -12,6 +12,7 @@ from sceneprior.core.mixtures import LogisticMixture, draw_index
 from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.prototypes import POSES, turned_looks
 from sceneprior.lifted.sampler.contents import Contents
+from sceneprior.lifted.sampler.look_scores import LookScores
 from sceneprior.lifted.sampler.placement import SHOWN, Placement
 from sceneprior.lifted.sampler.places import Places
 from sceneprior.lifted.sampler.reading import LENGTHS, Frame, Reading, lengths_shown
@@ -113,6 +114,7 @@ class RoomSampler(nn.Module):
         self.wanted_look = _head(known, width, MATCH_WIDTH)
         self.offered_look = _head(SHOWN, width, MATCH_WIDTH)
         self.frequency = nn.Parameter(torch.zeros(prototypes, POSES))
+        self.look_scores = LookScores(classes)
         self.extents_head = _head(known + width, width, EXTENTS * 7)
         self.placement = Placement(classes, min(2 * dropout, 0.5))
 
@@ -189,11 +191,14 @@ class RoomSampler(nn.Module):
         """Logits of the next object's look, given its class; looks of other classes are ruled
         out."""
         known = torch.cat([reading.context, self.class_embedding(label)], dim=-1)
-        offered = self.offered_look(self.look_shown[: self.looks])
+        shown = self.look_shown[: self.looks]
+        offered = self.offered_look(shown)
         logits = self.wanted_look(known) @ offered.T / math.sqrt(MATCH_WIDTH)
         own_pose = OWN_POSE.to(self.frequency.device)
         frequency = self.frequency[:, own_pose].transpose(0, 1).flatten(1)[:, : self.looks]
         logits = logits + frequency[reading.frame.symmetry]
+        counts = self.counts(reading.before) + reading.coming
+        logits = logits + self.look_scores(label, reading.before, counts, shown, self.backs)
         others = self.look_class[: self.looks] != label.unsqueeze(-1)
         return logits.masked_fill(others, -torch.inf)
 

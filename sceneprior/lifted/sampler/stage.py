@@ -34,8 +34,8 @@ from sceneprior.training.steps import (
 ORDERS = 4
 """Number of random object orders over which the likelihood of every val room is averaged."""
 TABLES_RATE = 10.0
-"""Learning rate of the tables of `Placement` relative to that of the rest. It is high because a
-pair of classes occurs in only a few batches of an epoch."""
+"""Learning rate of the tables of `Placement` and `LookScores` relative to that of the rest. It is
+high because a pair of classes occurs in only a few batches of an epoch."""
 TABLES_DECAY = 10.0
 """Weight decay of these tables relative to that of the rest."""
 CONTENTS_RATE = 5.0
