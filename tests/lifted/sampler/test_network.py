@@ -125,6 +125,24 @@ def test_how_often_a_look_comes_turns_with_the_room(sampler, rooms):
             sampler.frequency[0, 2] -= 3.0
 
 
+@torch.no_grad()
+def test_scores_by_the_other_furniture_are_added_to_looks(rooms):
+    sampler = small_sampler(rooms).double()
+    whole = in_float64(rooms.rooms)
+    coming = torch.eye(len(sampler.may_meet)).double()[2].expand(len(rooms), -1)
+    reading = read(sampler, whole, rectangles_of(whole), coming)
+    label = torch.full((len(rooms),), 2)
+    plain = sampler.look_logits(reading, label)
+    for table in sampler.look_scores.parameters():
+        table.normal_(generator=torch.Generator().manual_seed(0))
+    counts, shown = sampler.counts(whole) + coming, sampler.look_shown[: sampler.looks]
+    added = sampler.look_scores(label, whole, counts, shown, sampler.backs)
+    assert added.std() > 0.1
+    possible = plain.isfinite()
+    gain = sampler.look_logits(reading, label) - plain
+    assert_close(gain[possible], added[possible])
+
+
 def test_the_network_knows_what_is_to_come(sampler, rooms):
     whole = in_float64(rooms.rooms)
     coming = torch.eye(len(sampler.may_meet)).double()[1].expand(len(rooms), -1)
