@@ -92,9 +92,9 @@ def draw(seed: int) -> Draw:
     masks = str(rng.choice([*(TRACKED if tracked else UNTRACKED)]))
     return Draw(
         str(rng.choice(["bedroom", "living"])), int(rng.integers(1, MOST_ROOMS + 1, 2).min()),
-        int(rng.integers(6, 41, 2).min()), SIZES[rng.integers(len(SIZES))], int(rng.integers(55, 96)),
-        str(rng.choice([*POSES])), masks, tracked,
-        masks == "png" and not tracked or bool(rng.random() < 0.2), bool(rng.random() < 0.5),
+        int(rng.integers(6, 41, 2).min()), SIZES[rng.integers(len(SIZES))],
+        int(rng.integers(55, 96)), str(rng.choice([*POSES])), masks, tracked,
+        (masks == "png" and not tracked) or bool(rng.random() < 0.2), bool(rng.random() < 0.5),
         bool(rng.random() < 0.5),
     )  # fmt: skip
 

@@ -154,8 +154,8 @@ def write_grounded_sam2_images(room: PosedRoom) -> None:
             if (ids == thing.id).any()
         ]  # fmt: skip
         data = {
-            "image_path": f"images/{room.stem(view)}.jpg", "annotations": rows, "box_format": "xyxy",
-            "img_width": width, "img_height": height,
+            "image_path": f"images/{room.stem(view)}.jpg", "annotations": rows,
+            "box_format": "xyxy", "img_width": width, "img_height": height,
         }  # fmt: skip
         (room.folder / f"json_data/results_{view}.json").write_text(json.dumps(data))
 
@@ -180,9 +180,8 @@ def write_coco_images(
     height, width = room.size
     images, rows = [], []
     for view in range(len(room.poses)):
-        images.append(
-            {"id": 7 + view, "file_name": f"{room.stem(view)}.jpg", "height": height, "width": width}
-        )
+        picture = f"{room.stem(view)}.jpg"
+        images.append({"id": 7 + view, "file_name": picture, "height": height, "width": width})
         ids = room.ids(view)
         for thing in room.things:
             mask = ids == thing.id

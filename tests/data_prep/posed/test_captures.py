@@ -77,6 +77,7 @@ def test_a_lens_that_folds_the_picture_over_names_the_frame(room):
 
 # -- COLMAP ----------------------------------------------------------------------------------------
 
+
 def steps(views):
     """Each camera in the first one's frame: the same whatever the world."""
     poses = views.world_to_camera.astype(float)
