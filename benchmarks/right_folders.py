@@ -24,6 +24,8 @@ from data_prep.engine.build import Job, build_shards
 from data_prep.front.recipe import load_recipe
 from data_prep.front.source import FrontSource
 from data_prep.homes.make import make_homes
+from data_prep.inspection.causes import GIVEN
+from data_prep.inspection.verdicts import what_was_checked
 from data_prep.inspection.verify import verify
 from data_prep.posed.source import PosedSource
 from data_prep.posed.views import PosedSettings
@@ -194,8 +196,19 @@ def make_shards(drawn: Draw, seed: int, homes: Path, out: Path) -> None:
         shutil.rmtree(folder)
 
 
-def said_of(drawn: Draw, seed: int, out: Path) -> list[str]:
-    """Sentences of `prep-posed` that refuse the folder, or problems that `inspect` finds in it."""
+class Verdict(NamedTuple):
+    """Result of one folder."""
+
+    problems: tuple[str, ...]
+    """The sentence of `prep-posed` that refuses the folder, or what `inspect --verify` finds."""
+    fit: float = 0.0
+    """Mean agreement of masks and cameras."""
+    checked: bool = False
+    """Some mistakes are excluded: the verdict is more than that little could be checked."""
+
+
+def verdict(drawn: Draw, seed: int, out: Path) -> Verdict:
+    """Make the folder, unless it is there, and verify it."""
     try:
         if not (out / "shards" / "index.json").is_file():
             block = seed // HOMES_FOR
@@ -203,9 +216,12 @@ def said_of(drawn: Draw, seed: int, out: Path) -> list[str]:
             if not homes.is_dir():
                 make_homes(homes, 2 * HOMES_FOR * MOST_ROOMS, drawn.kind, seed=1000 + block)
             make_shards(drawn, seed, homes, out)
-        return list(verify(out / "shards").problems)
+        found = verify(out / "shards")
     except InputError as error:
-        return [f"refused: {error}"]
+        return Verdict((f"refused: {error}",))
+    evidence = found.evidence
+    assert evidence is not None, "rooms with sound arrays have evidence"
+    return Verdict(found.problems, evidence.share(GIVEN), bool(what_was_checked(evidence)[0]))
 
 
 def main() -> None:
@@ -213,20 +229,25 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--seeds", type=int, nargs=2, default=(0, 100), metavar=("FIRST", "END"))
     options = parser.parse_args()
-    accused: list[bool] = []
+    verdicts: list[Verdict] = []
     of: dict[str, Counter[bool]] = {}
     start = time.process_time()
     for seed in range(*options.seeds):
         drawn = draw(seed)
-        said = said_of(drawn, seed, options.out / f"{seed:03d}")
-        accused.append(bool(said))
+        verdicts.append(found := verdict(drawn, seed, options.out / f"{seed:03d}"))
         tracks = "untracked" if drawn.auto or not drawn.tracked else "tracked"
-        for group in (drawn.kind, drawn.poses, drawn.masks, tracks, "noisy" * drawn.noisy):
-            of.setdefault(group or "exact", Counter())[bool(said)] += 1
-        print(seed, *drawn, "-" if not said else f"ACCUSED: {' | '.join(said)}", flush=True)
-    print(f"{sum(accused)} of {len(accused)} accused; {time.process_time() - start:.0f} CPU s")
-    for name, counts in of.items():
-        print(f"{name}: {counts[True]} of {counts.total()}")
+        noise = "noisy" if drawn.noisy else "exact"
+        for group in (drawn.kind, drawn.poses, drawn.masks, tracks, noise):
+            of.setdefault(group, Counter())[bool(found.problems)] += 1
+        said = f"ACCUSED: {' | '.join(found.problems)}" if found.problems else "-"
+        print(seed, *drawn, f"{found.fit:.2f}", found.checked, said, flush=True)
+    accused, checked = (sum(map(bool, column)) for column in (
+        [found.problems for found in verdicts], [found.checked for found in verdicts]
+    ))  # fmt: skip
+    print(f"{accused} of {len(verdicts)} folders accused; in {checked} some mistakes are excluded")
+    print(f"least fit {min(found.fit for found in verdicts):.2f}")
+    print("; ".join(f"{name} {counts[True]} of {counts.total()}" for name, counts in of.items()))
+    print(f"{time.process_time() - start:.0f} CPU s")
 
 
 if __name__ == "__main__":
