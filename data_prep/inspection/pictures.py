@@ -1,22 +1,18 @@
-"""Draws a view or the floor plan of a room in a shard, and sheets of them."""
+"""Draws a view or the floor plan of a room in a shard."""
 
-import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import shapely
 from PIL import Image, ImageDraw, ImageFont
 
-from data_prep.engine.source import SPLITS
 from data_prep.inspection.projection import Segment, to_camera, wire_pixels
 from sceneprior.core.classes import class_colors, label_set
-from sceneprior.core.errors import InputError
 from sceneprior.core.found_floor import find_floor
 from sceneprior.core.geometry.corners import BOX_EDGES, box_corners
-from sceneprior.core.shards import RoomGroundTruth, RoomViews, Shard, list_shards
-from sceneprior.render.pictures import contact_sheet, paint_ids
+from sceneprior.core.shards import RoomGroundTruth, RoomViews, Shard
+from sceneprior.render.pictures import paint_ids
 
 BACKGROUND = (246, 246, 246)
 GRID = (206, 206, 206)
@@ -28,68 +24,8 @@ _GRID_M = 1.0
 _BAR_M = 0.3
 _LARGEST_GRID_M = 15.0
 
-LEGEND = (
-    "Filled: instance masks in class colours. Coloured frames: their 2D boxes, with the object's "
-    "number, the same in all views. Black wires: 3D "
-    "boxes of the ground truth, with a bar ahead of the piece's front. Grid: the floor y = 0, "
-    "metres, with the room's axes x, y, z. From above, found in masks of floor, walls and doors: "
-    "the floor that some view shows (filled), walls (brown) and doors (orange)."
-)
-_TILE = (480, 360)
-_GAP_PX, _LINE_PX = 8, 15
 
 Color = tuple[int, int, int]
-
-
-def draw_sheet(
-    folder: Path, room_id: str | None = None, pictures: int = 24, boxes_3d: bool = True
-) -> Image.Image:
-    """Draw views of a folder, or of one room and its plan, on one sheet; see `LEGEND`."""
-    captions: list[str] = []
-    tiles: list[np.ndarray] = []
-    for path, name, view in choose_views(folder, room_id, pictures):
-        short = name if len(name) <= 56 else f"{name[:8]}...{name[-45:]}"
-        with Shard(path) as shard:
-            if room_id is not None and not tiles:
-                captions.append(f"{short}  from above")
-                tiles.append(np.asarray(draw_plan(shard, name, *_TILE)))
-            captions.append(f"{short}  view {view}")
-            tiles.append(np.asarray(draw_view(shard, name, view, boxes_3d, _TILE[0])))
-    sheet = contact_sheet(tiles, min(4, len(tiles)), captions, _GAP_PX)
-    legend = textwrap.wrap(LEGEND, max(40, sheet.shape[1] // 6))
-    borders = ((_LINE_PX * len(legend), _GAP_PX), (0, 0), (0, 0))
-    picture = Image.fromarray(np.pad(sheet, borders, constant_values=255))
-    draw = ImageDraw.Draw(picture)
-    for i, line in enumerate(legend):
-        place, font = (_GAP_PX, 4 + _LINE_PX * i), _font(11)
-        draw.text(place, line, fill="black", font=font)
-    return picture
-
-
-def choose_views(folder: Path, room_id: str | None, pictures: int) -> list[tuple[Path, str, int]]:
-    """Shard, room and number of views spread evenly over a folder, or over one room."""
-    splits = [split for split in SPLITS if any((Path(folder) / split).glob("*.h5"))]
-    rooms = []
-    for path in [path for split in splits for path in list_shards(folder, split)]:
-        with Shard(path) as shard:
-            rooms += [(path, name) for name in shard.room_ids]
-    if not rooms:
-        list_shards(folder, "train")  # raises the error that explains why
-    if room_id is not None:
-        rooms = [room for room in rooms if room[1] == room_id]
-        if not rooms:
-            raise InputError(f"{folder} has no room '{room_id}'; its report.csv lists the rooms.")
-    if len(rooms) > pictures:
-        rooms = [rooms[i * len(rooms) // pictures] for i in range(pictures)]
-    chosen = []
-    for i, (path, name) in enumerate(rooms):
-        share = pictures // len(rooms) + (i < pictures % len(rooms))
-        with Shard(path) as shard:
-            views = len(shard.read_room(name).visible)
-        # Views are evenly spaced, because a recording's views are in temporal order.
-        places = np.unique(np.linspace(0, views, min(share, views), endpoint=False).astype(int))
-        chosen += [(path, name, int(view)) for view in places]
-    return chosen
 
 
 def draw_view(
@@ -123,7 +59,7 @@ def draw_view(
         ends = np.stack([np.zeros(3), end])
         wires.line(ends, AXES[name], 2)
         for line in wires.pixels(ends, [(0, 1)]):
-            draw.text(line[2:], name, fill=AXES[name], font=_font(12), anchor="mm")
+            draw.text(line[2:], name, fill=AXES[name], font=font_of(12), anchor="mm")
     seen = np.flatnonzero(room.visible[view])
     if truth is not None:
         for number in seen.tolist():
@@ -189,7 +125,7 @@ def draw_plan(shard: Shard, room_id: str, width_px: int = 480, height_px: int = 
         draw.line((u, v, *at(ahead[0], ahead[2])), fill=OUTLINE)
     for name, (x, z) in {"x": (_AXIS_M, 0.0), "z": (0.0, _AXIS_M)}.items():
         draw.line((*at(0, 0), *at(x, z)), fill=AXES[name], width=2)
-        draw.text(at(1.2 * x, 1.2 * z), name, fill=AXES[name], font=_font(12), anchor="mm")
+        draw.text(at(1.2 * x, 1.2 * z), name, fill=AXES[name], font=font_of(12), anchor="mm")
     return picture
 
 
@@ -266,9 +202,9 @@ def _front(truth: RoomGroundTruth, k: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _tag(draw: ImageDraw.ImageDraw, place: tuple[float, float], text: str, color: Color) -> None:
-    left, top, right, bottom = draw.textbbox(place, text, font=_font(11))
+    left, top, right, bottom = draw.textbbox(place, text, font=font_of(11))
     draw.rectangle((left - 1, top - 1, right + 1, bottom + 1), fill=color)
-    draw.text(place, text, fill="white", font=_font(11))
+    draw.text(place, text, fill="white", font=font_of(11))
 
 
 def _dark(color: np.ndarray) -> Color:
@@ -276,5 +212,5 @@ def _dark(color: np.ndarray) -> Color:
     return (red, green, blue)
 
 
-def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+def font_of(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     return ImageFont.load_default(size=size)

@@ -11,7 +11,7 @@ from data_prep.engine.source import SPLITS
 from data_prep.inspection.agreement import Agreement
 from data_prep.inspection.bodies import KINDS
 from data_prep.inspection.causes import CHANCE, GIVEN
-from data_prep.inspection.pictures import choose_views
+from data_prep.inspection.sheet import choose_views
 from data_prep.inspection.verdicts import what_was_checked
 from data_prep.inspection.verify import FolderCheck, RoomCheck, evidence_of
 from data_prep.inspection.words import counts

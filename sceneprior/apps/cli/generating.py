@@ -32,6 +32,8 @@ from sceneprior.apps.cli.options import (
 
 BROKEN_TOLD = 5
 """Maximum number of broken models whose reasons `retrieve` prints."""
+EMPTY_TOLD = 5
+"""Maximum number of empty rooms that `synthesize` names."""
 
 
 def synthesize(
@@ -58,7 +60,6 @@ def synthesize(
     """
     from sceneprior.apps.api import load
     from sceneprior.apps.rooms import PAGE_FILE, check_free, write_scenes
-    from sceneprior.evaluation.metrics.contents import emptiness
     from sceneprior.evaluation.rooms_page import write_rooms_page
 
     check_free(out, overwrite)
@@ -73,8 +74,13 @@ def synthesize(
         told = f"run {Path(run).resolve().name} · seed {seed} · from: {origin}"
         write_rooms_page(out / PAGE_FILE, scenes, title="New rooms", subtitle=told)
     typer.echo(f"Wrote {count} rooms to {out} (from: {origin})")
-    if (warning := emptiness(scenes)) is not None:
-        typer.echo(f"Warning: {warning}", err=True)
+    if empty := [scene.name for scene in scenes if not scene.objects]:
+        more = f" and {len(empty) - EMPTY_TOLD} more" * (len(empty) > EMPTY_TOLD)
+        typer.echo(
+            f"Note: {len(empty)} of {count} rooms are empty (no object): "
+            f"{', '.join(empty[:EMPTY_TOLD])}{more}. Train longer, or on more rooms.",
+            err=True,
+        )
 
 
 _END_HELP = "a training room's id, seed:7, or a latent in a file: scenes/latents.npz:seed0_0003."

@@ -21,18 +21,31 @@ def rooms(command, toy_run, tmp_path):
     return tmp_path / "rooms"
 
 
-def test_empty_rooms_are_written_with_a_warning(command, toy_run, monkeypatch):
-    call = ["synthesize", "--run", toy_run, "-n", 3]
+def test_empty_rooms_are_written_and_named(command, toy_run, monkeypatch):
+    call = ["synthesize", "--run", toy_run, "-n", 7]
     status, _, errors = command(*call, "--out", "full")
     assert status == 0 and "empty" not in errors
-    monkeypatch.setattr(
-        decode, "kept_objects", lambda logits, target: torch.zeros_like(logits, dtype=torch.bool)
-    )
-    status, out, errors = command(*call, "--out", "none")
-    assert (status, out) == (0, "Wrote 3 rooms to none (from: paper)\n")
+    kept = decode.kept_objects
+
+    def keep(rooms):
+        """Keep the objects of some rooms only."""
+        drawn = torch.zeros(7, 1, dtype=torch.bool)
+        drawn[rooms] = True
+        monkeypatch.setattr(
+            decode, "kept_objects", lambda logits, target: kept(logits, target) & drawn
+        )
+
+    keep([0, 1, 2, 4, 5, 6])
+    status, out, errors = command(*call, "--out", "one")
+    assert (status, out) == (0, "Wrote 7 rooms to one (from: paper)\n")
     assert errors.strip().splitlines()[-1] == (
-        "Warning: 3 of 3 generated rooms are empty, so none of the other scores can be trusted: "
-        "train longer."
+        "Note: 1 of 7 rooms are empty (no object): seed0_0003. Train longer, or on more rooms."
+    )
+    keep([])
+    status, _, errors = command(*call, "--out", "none")
+    assert status == 0 and errors.strip().splitlines()[-1].startswith(
+        "Note: 7 of 7 rooms are empty (no object): seed0_0000, seed0_0001, seed0_0002, seed0_0003, "
+        "seed0_0004 and 2 more. Train"
     )
 
 

@@ -11,7 +11,7 @@ from PIL import Image
 from posed_files import SET, PosedRoom
 
 from data_prep.engine.build import Job, build_shards
-from data_prep.inspection.pictures import draw_sheet
+from data_prep.inspection.sheet import draw_sheet, legend
 from data_prep.inspection.tables import count_tables, room_table
 from data_prep.posed.source import PosedSource
 from sceneprior.core.errors import InputError
@@ -33,6 +33,27 @@ def test_a_sheet_of_a_folder_and_of_a_room(shards):
     assert room.width == 4 * 488 + 8  # its plan comes first
     with pytest.raises(InputError, match=r"has no room 'attic'; its report\.csv lists the rooms"):
         draw_sheet(shards, "attic")
+
+
+def test_the_legend_explains_what_the_sheet_shows(shards, tmp_path, monkeypatch):
+    drawn = []
+
+    def spied(wires, floors):
+        drawn.append((wires, floors))
+        return legend(wires, floors)
+
+    monkeypatch.setattr("data_prep.inspection.sheet.legend", spied)
+    room = PosedRoom(tmp_path / "rooms" / "attic").write()
+    build_shards(Job(PosedSource(room.folder, SET), tmp_path / "posed"))
+    draw_sheet(shards, pictures=1)
+    draw_sheet(shards, pictures=1, boxes_3d=False)
+    draw_sheet(shards, "house0_Bedroom-0", pictures=1)
+    draw_sheet(tmp_path / "posed", "attic", pictures=1)
+    assert drawn == [(True, False), (False, False), (True, True), (False, False)]
+    # Captures have no ground truth, and nothing in the legend says that they have.
+    assert "ground truth" not in legend(False, True) and "From above" not in legend(True, False)
+    assert "Black wires: 3D boxes of the ground truth" in legend(True, False)
+    assert "walls (brown)" in legend(False, True)
 
 
 def test_the_command_prints_and_draws(shards, tmp_path, cli):

@@ -1,7 +1,6 @@
 """Writers of the files that other tools write, of the rooms of `posed_files`."""
 
 import json
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -24,10 +23,6 @@ def write_plain(room: PosedRoom) -> None:
     room.write(floor_m=0.0, floor_center_m=[0.1, -0.2])
 
 
-def stem(view: int) -> str:
-    return f"frame_{view:05d}"
-
-
 def write_room_keys(room: PosedRoom) -> None:
     """A transforms.json that has keys about the room only."""
     room.write_transforms(FLOOR)
@@ -47,8 +42,7 @@ def write_polycam(room: PosedRoom, folder: str = "corrected_cameras") -> None:
         data |= {"fx": room.focal_px, "fy": room.focal_px, "cx": width / 2, "cy": height / 2}
         data |= {"width": width, "height": height, "blur_score": 112.5, "manual_keyframe": False}
         (place / f"{timestamp(view)}.json").write_text(json.dumps(data))
-        if room.png(view).is_file():
-            room.png(view).rename(room.folder / "instances" / f"{timestamp(view)}.png")
+    room.rename(timestamp)
     write_room_keys(room)
 
 
@@ -60,10 +54,9 @@ def write_record3d(room: PosedRoom, name: str = "metadata", per_frame: bool = Fa
     """The JSON of a recording with the LiDAR camera; the world's y is up, as for a level start."""
     height, width = room.size
     poses = []
-    for view, pose in enumerate(room.poses):
+    for pose in room.poses:
         pose = Y_UP @ pose
         poses.append([*Rotation.from_matrix(pose[:3, :3]).as_quat(), *pose[:3, 3]])
-        room.png(view).rename(room.folder / "instances" / f"{view}.png")
     f, x, y = room.focal_px, width / 2, height / 2
     data: dict[str, Any] = {
         "w": width, "h": height, "dw": 192, "dh": 256, "fps": 60, "cameraType": 1,
@@ -76,6 +69,7 @@ def write_record3d(room: PosedRoom, name: str = "metadata", per_frame: bool = Fa
     path = room.folder / name
     path.parent.mkdir(exist_ok=True)
     path.write_text(json.dumps(data))
+    room.rename(str)
     write_room_keys(room)
 
 
@@ -101,7 +95,7 @@ def write_sam2(room: PosedRoom, place: str = ".", hidden: bool = True) -> None:
             if hidden or mask.any():
                 picture = Image.fromarray(mask)
                 picture.putpalette([0, 0, 0, 128, 0, 0])
-                picture.save(folder / f"{stem(view)}.png")
+                picture.save(folder / f"{room.stem(view)}.png")
 
 
 def write_grounded_sam2(room: PosedRoom) -> None:
@@ -112,7 +106,7 @@ def write_grounded_sam2(room: PosedRoom) -> None:
     height, width = room.size
     for view in range(len(room.poses)):
         ids = room.ids(view)
-        np.save(room.folder / f"mask_data/mask_{stem(view)}.npy", ids.astype(np.uint16))
+        np.save(room.folder / f"mask_data/mask_{room.stem(view)}.npy", ids.astype(np.uint16))
         labels = {
             str(thing.id): {
                 "instance_id": thing.id, "class_name": thing.name, "x1": 1, "y1": 2, "x2": 3,
@@ -122,10 +116,10 @@ def write_grounded_sam2(room: PosedRoom) -> None:
             if (ids == thing.id).any()
         }  # fmt: skip
         data = {
-            "mask_name": f"mask_{stem(view)}.npy", "mask_height": height, "mask_width": width,
+            "mask_name": f"mask_{room.stem(view)}.npy", "mask_height": height, "mask_width": width,
             "promote_type": "mask", "labels": labels,
         }  # fmt: skip
-        (room.folder / f"json_data/mask_{stem(view)}.json").write_text(json.dumps(data))
+        (room.folder / f"json_data/mask_{room.stem(view)}.json").write_text(json.dumps(data))
 
 
 def packed(mask: np.ndarray) -> dict[str, Any]:
@@ -144,8 +138,8 @@ def outlines(mask: np.ndarray) -> list[list[float]]:
     return [[float(value) for value in polygon] for polygon in found]
 
 
-def write_grounded_sam2_images(room: PosedRoom, name: Callable[[int], str] = stem) -> None:
-    """The JSON of a demo of single images, for each frame; `name` is the picture's."""
+def write_grounded_sam2_images(room: PosedRoom) -> None:
+    """The JSON of a demo of single images, for each frame."""
     remove_pngs(room)
     (room.folder / "json_data").mkdir()
     height, width = room.size
@@ -160,8 +154,8 @@ def write_grounded_sam2_images(room: PosedRoom, name: Callable[[int], str] = ste
             if (ids == thing.id).any()
         ]  # fmt: skip
         data = {
-            "image_path": f"images/{name(view)}.jpg", "annotations": rows, "box_format": "xyxy",
-            "img_width": width, "img_height": height,
+            "image_path": f"images/{room.stem(view)}.jpg", "annotations": rows,
+            "box_format": "xyxy", "img_width": width, "img_height": height,
         }  # fmt: skip
         (room.folder / f"json_data/results_{view}.json").write_text(json.dumps(data))
 
@@ -186,9 +180,8 @@ def write_coco_images(
     height, width = room.size
     images, rows = [], []
     for view in range(len(room.poses)):
-        images.append(
-            {"id": 7 + view, "file_name": f"{stem(view)}.jpg", "height": height, "width": width}
-        )
+        picture = f"{room.stem(view)}.jpg"
+        images.append({"id": 7 + view, "file_name": picture, "height": height, "width": width})
         ids = room.ids(view)
         for thing in room.things:
             mask = ids == thing.id
@@ -211,7 +204,7 @@ def write_coco_video(room: PosedRoom) -> None:
     """One annotation per object, with a mask or null for each frame, as in YouTube-VIS."""
     remove_pngs(room)
     height, width = room.size
-    names = [f"attic/{stem(view)}.jpg" for view in range(len(room.poses))]
+    names = [f"attic/{room.stem(view)}.jpg" for view in range(len(room.poses))]
     video = {"id": 3, "width": width, "height": height, "length": len(names), "file_names": names}
     ids = [room.ids(view) for view in range(len(names))]
 

@@ -1,7 +1,7 @@
 """A writer of small posed rooms: boxes, cameras, transforms.json, ids, a table of classes."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -58,6 +58,8 @@ class PosedRoom:
     focal_px: float = 80.0
     poses: list[np.ndarray] = field(default_factory=list)
     """camera_to_world, OpenGL axes."""
+    stem: Callable[[int], str] = "frame_{:05d}".format
+    """Name of a view's picture."""
 
     def __post_init__(self) -> None:
         for eye in EYES:
@@ -96,7 +98,7 @@ class PosedRoom:
             "cx": width / 2, "cy": height / 2, "w": width, "h": height, "k1": 0.0, "p1": 0,
             "aabb_scale": 16, "applied_transform": [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]],
             "frames": [
-                {"file_path": f"images/frame_{k:05d}.jpg", "transform_matrix": pose.tolist()}
+                {"file_path": f"images/{self.stem(k)}.jpg", "transform_matrix": pose.tolist()}
                 for k, pose in enumerate(self.poses)
             ],
         }  # fmt: skip
@@ -116,7 +118,15 @@ class PosedRoom:
         (self.folder / "transforms.json").write_text(json.dumps(data))
 
     def png(self, view: int) -> Path:
-        return self.folder / "instances" / f"frame_{view:05d}.png"
+        return self.folder / "instances" / f"{self.stem(view)}.png"
+
+    def rename(self, stem: Callable[[int], str]) -> None:
+        """Give the pictures other names."""
+        old = [self.png(view) for view in range(len(self.poses))]
+        self.stem = stem
+        for view, path in enumerate(old):
+            if path.is_file():
+                path.rename(self.png(view))
 
 
 def prepared(

@@ -4,9 +4,9 @@ import capture_files as tools
 import numpy as np
 import pytest
 from capture_files import refusal, same_masks
+from colmap_files import write_colmap
 from PIL import Image
 from posed_files import SET, PosedRoom, furniture, prepared
-from test_captures import write_colmap
 from test_untracked import same_objects
 
 from data_prep.posed.formats import MASKS, read_formats

@@ -13,7 +13,7 @@ def test_masks_that_overlap_show_the_smaller_one(room, plain):
     hidden = plain.views.instance_ids == 2
     assert hidden.any()
     for view in range(len(room.poses)):
-        path = room.folder / "003" / f"{tools.stem(view)}.png"
+        path = room.folder / "003" / f"{room.stem(view)}.png"
         whole = np.isin(room.ids(view), (3, 300)).astype(np.uint8)
         Image.fromarray(whole).save(path)
     same_masks(prepared(room).views, plain.views)
@@ -29,7 +29,7 @@ def test_sam2_knows_no_classes(room):
 
 def test_object_folders_that_cannot_be_used(room):
     tools.write_sam2(room)
-    path = room.folder / "007" / f"{tools.stem(1)}.png"
+    path = room.folder / "007" / f"{room.stem(1)}.png"
     Image.fromarray(np.zeros((9, 8), dtype=np.uint8)).save(path)
     assert f"{path} is 8 x 9 pixels, but the masks of other objects 128 x 96; wr" in refusal(room)
     Image.fromarray(room.ids(1)).save(path)
@@ -45,7 +45,7 @@ def test_masks_of_other_frames_are_named(room):
     tools.write_sam2(room)
     for folder in ("003", "007", "300"):
         for view in range(10):
-            path = room.folder / folder / f"{tools.stem(view)}.png"
+            path = room.folder / folder / f"{room.stem(view)}.png"
             path.rename(path.with_name(f"{view:05d}.png"))
     said = refusal(room)
     assert "none of its 10 frames has a mask; expected " in said
