@@ -115,6 +115,7 @@ def refuse(number: int):
         ),
         (errno.EROFS, "(Read-only file system); name a folder that can be written."),
         (errno.EACCES, "(Permission denied); change its permissions, or name another"),
+        (errno.ENOENT, "(No such file or directory); check the path, or name another folder."),
         (errno.EDQUOT, "(Disk quota exceeded); free space in your quota"),
         (errno.EMFILE, "(Too many open files); allow more open files with `ulimit -n 4096`."),
     ],
@@ -144,6 +145,14 @@ def test_what_a_command_could_not_write_is_named(command, toy_run, monkeypatch, 
     said = one_sentence(command(name, *run, *more, "target"))
     assert "target cannot be read or written (No space left on device); free space" in said
     assert not list(Path().iterdir())
+
+
+@pytest.mark.parametrize("words", [("synthesize", "-n", 1, "--out"), ("make-homes",)])
+def test_a_folder_that_cannot_be_made_is_a_sentence(command, toy_run, words):
+    name, *more = words
+    run = [] if name == "make-homes" else ["--run", toy_run]
+    said = one_sentence(command(name, *run, *more, "/proc/none"))
+    assert "/proc/none" in said and "cannot be read or written (No such file or directory)" in said
 
 
 def test_a_folder_is_no_file_for_results(command, toy_run, tmp_path):
