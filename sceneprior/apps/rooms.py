@@ -18,7 +18,7 @@ from sceneprior.core.shell import ShellName
 from sceneprior.paper.sampling import LATENTS_FILE, write_latents
 from sceneprior.render.pictures import contact_sheet, png_bytes
 from sceneprior.render.scene_files import check_names, format_of, save_scene
-from sceneprior.render.topdown import perspective, room_view
+from sceneprior.render.topdown import perspective, view_of
 
 PAGE_FILE = "rooms.html"
 OVERVIEW_ROOMS = 12
@@ -84,10 +84,8 @@ def overview(
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Contact sheet of one or more rooms from above a corner, four per row, coloured by class.
 
-    If `shell` is `walls`, the walls behind the furniture are drawn; the floor is always drawn.
+    The walls behind the furniture are drawn if `shell` is `walls`, or the room has doors or
+    windows; the floor is always drawn.
     """
-    views = [room_view(scene, OVERVIEW_TILE) if shell == "walls" else None for scene in scenes]
-    tiles = [
-        perspective(scene, OVERVIEW_TILE, view) for scene, view in zip(scenes, views, strict=True)
-    ]
+    tiles = [perspective(scene, view=view_of(scene, OVERVIEW_TILE, shell)) for scene in scenes]
     return contact_sheet(tiles, min(4, len(tiles)))

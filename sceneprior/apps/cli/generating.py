@@ -56,7 +56,7 @@ def synthesize(
 ) -> None:
     """Generate rooms: JSON, GLB and a top-down PNG each, and latents if the method has them.
 
-    Without --shell, GLBs hold furniture only.
+    Without --shell, GLBs hold furniture only. Pictures of rooms with doors or windows show walls.
     """
     from sceneprior.apps.api import load
     from sceneprior.apps.rooms import PAGE_FILE, check_free, write_scenes
@@ -72,7 +72,7 @@ def synthesize(
     origin = distribution or prior.distribution
     if html:
         told = f"run {Path(run).resolve().name} · seed {seed} · from: {origin}"
-        write_rooms_page(out / PAGE_FILE, scenes, title="New rooms", subtitle=told)
+        write_rooms_page(out / PAGE_FILE, scenes, title="New rooms", subtitle=told, shell=drawn)
     typer.echo(f"Wrote {count} rooms to {out} (from: {origin})")
     if empty := [scene.name for scene in scenes if not scene.objects]:
         more = f" and {len(empty) - EMPTY_TOLD} more" * (len(empty) > EMPTY_TOLD)

@@ -1,8 +1,11 @@
 """The command line: commands that work on a toy run, and one sentence for what does not."""
 
+import base64
 import errno
+import io
 import json
 import os
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -68,11 +71,16 @@ def test_synthesize_writes_rooms_and_the_same_again(command, toy_run, tmp_path):
 
 
 def test_synthesize_writes_walls_if_asked(command, toy_run, tmp_path):
-    call = ["synthesize", "--run", toy_run, "-n", 1, "--out"]
+    call = ["synthesize", "--run", toy_run, "-n", 1, "--html", "--out"]
     for shell, nodes in (("walls", {"floor", "wall_0", "ceiling"}), ("none", set())):
         assert command(*call, shell, "--shell", shell)[0] == 0
         found = set(trimesh.load_scene(tmp_path / shell / "seed0_0000.glb").graph.nodes_geometry)
         assert found & {"floor", "wall_0", "ceiling"} == nodes
+        page = (tmp_path / shell / "rooms.html").read_text()
+        (model,) = re.findall('src="data:model/gltf-binary;base64,([^"]+)"', page)
+        model = trimesh.load_scene(io.BytesIO(base64.b64decode(model)), file_type="glb")
+        shown = set(model.graph.nodes_geometry) & {"floor", "wall_0", "ceiling"}
+        assert shown == {"floor"} | nodes  # a page shows the floor in any case
     pictures = [(tmp_path / shell / "overview.png").read_bytes() for shell in ("walls", "none")]
     assert pictures[0] != pictures[1]
     said = one_sentence(command(*call, "other", "--shell", "roof"))
