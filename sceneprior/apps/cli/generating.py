@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from sceneprior.apps.cli.messages import rooms_in_words
 from sceneprior.apps.cli.options import (
     MODELS_HELP,
     OWN_HELP,
@@ -73,7 +74,7 @@ def synthesize(
     if html:
         told = f"run {Path(run).resolve().name} · seed {seed} · from: {origin}"
         write_rooms_page(out / PAGE_FILE, scenes, title="New rooms", subtitle=told, shell=drawn)
-    typer.echo(f"Wrote {count} rooms to {out} (from: {origin})")
+    typer.echo(f"Wrote {rooms_in_words(count)} to {out} (from: {origin})")
     if empty := [scene.name for scene in scenes if not scene.objects]:
         more = f" and {len(empty) - EMPTY_TOLD} more" * (len(empty) > EMPTY_TOLD)
         typer.echo(
@@ -148,8 +149,9 @@ def complete(
     scenes = prior.complete(scene, count, seed, distribution, wanted, **asked, cad=cad)
     write_scenes(scenes, out, drawn)
     note_unmet(scenes)
+    given_objects = f"{len(scene.objects)} given object{'s' * (len(scene.objects) != 1)}"
     how = "drawn by the sampler" if scenes[0].latent is None else "decoded from fitted latents"
-    typer.echo(f"Wrote {count} rooms around {len(scene.objects)} given objects, {how}, to {out}")
+    typer.echo(f"Wrote {rooms_in_words(count)} around {given_objects}, {how}, to {out}")
     for room in scenes:
         if lacking := room.extra.get("no_place"):
             typer.echo(f"Note: {room.name} has no place for {', '.join(lacking)}.", err=True)
@@ -200,4 +202,4 @@ def retrieve(
         typer.echo(f"{len(broken)} models are broken; see retrieval.json")
     for reason in [*broken.values()][:BROKEN_TOLD]:
         typer.echo(f"Note: {reason}.", err=True)
-    typer.echo(f"Wrote {len(made)} rooms to {out}")
+    typer.echo(f"Wrote {rooms_in_words(len(made))} to {out}")

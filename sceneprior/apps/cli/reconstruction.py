@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from sceneprior.apps.cli.messages import rooms_in_words
 from sceneprior.apps.cli.options import (
     MODELS_HELP,
     OverwriteOption,
@@ -113,7 +114,7 @@ def reconstruct(
     write_reconstructions(found, out)
     if mask is not None:
         write_page(found[0], out)
-    typer.echo(f"Wrote {len(found)} room{'s' * (len(found) != 1)} to {out}")
+    typer.echo(f"Wrote {rooms_in_words(len(found))} to {out}")
 
 
 def eval_svr(

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from sceneprior.apps.cli.messages import rooms_in_words
 from sceneprior.apps.cli.options import OverwriteOption, ShellOption, checked_shell
 from sceneprior.core.errors import InputError
 
@@ -144,4 +145,4 @@ def export(
         asked = None if shell is None else checked_shell(shell)
         for note in export_scenes(rooms, to, out, asked):
             typer.echo(f"Note: {note}", err=True)
-    typer.echo(f"Wrote {len(rooms)} rooms to {out}")
+    typer.echo(f"Wrote {rooms_in_words(len(rooms))} to {out}")

@@ -33,7 +33,7 @@ def test_bad_shards_are_sentences_and_leave_no_run(command, toy_shards, tmp_path
 
     empty = tmp_path / "empty"
     (empty / "train").mkdir(parents=True)
-    assert "The 'train' split of " in fit(empty) and "holds no shards" in fit(empty)
+    assert "empty has no index.json; it is not a finished folder of shards" in fit(empty)
 
     corrupt = shutil.copytree(toy_shards, tmp_path / "corrupt")
     victim = list_shards(corrupt, "train")[1]
