@@ -128,8 +128,9 @@ def test_a_former_section_that_asks_for_nothing_is_dropped(config):
     for former in ("{every: 0, count: 200, seed: 0, metric: category_kl}", "{count: 5}", "{}"):
         assert load_config(str(config), (f"samples={former}",)) == load_config(str(config))
     assert refusal(config, "samples={every: 25}") == (
-        f"{config} with samples={{every: 25}}: 'samples.every' is 25, but training no longer evaluates "
-        "generated rooms; delete the section `samples`. The run's final.ckpt is read as before."
+        f"{config} with samples={{every: 25}}: 'samples.every' is 25, but training no longer "
+        "evaluates generated rooms; delete the section `samples`. The run's final.ckpt is read as "
+        "before."
     )
     data = yaml.safe_load(config.read_text()) | {"samples": {"every": 0}}
     with pytest.raises(ConfigError, match="unknown key 'samples'"):
@@ -225,7 +226,8 @@ def test_set_overrides_what_the_file_says(config):
     ("override", "said"),
     [
         ("data.shard=mine",
-         " with data.shard=mine: unknown key 'data.shard'; the nearest valid key is 'data.shards'."),
+         " with data.shard=mine: unknown key 'data.shard'; the nearest valid key is 'data.shards'"
+         "."),
         ("model.width", "--set takes section.key=value, got 'model.width'."),
         ("model.width.deep=3", "--set model.width.deep=3: 'width' is a value, not a section."),
         ("model.width=[", "--set model.width=[: '[' is not a YAML value."),
