@@ -10,8 +10,7 @@ from jaxtyping import UInt8
 from rich.console import Console
 from rich.progress import Progress
 
-from sceneprior.core.errors import InputError
-from sceneprior.core.files import PARTS, check_writable, write_whole
+from sceneprior.core.files import PARTS, write_whole
 from sceneprior.core.scene import Scene
 from sceneprior.core.scene_json import FORMAT
 from sceneprior.core.shell import ShellName
@@ -33,16 +32,6 @@ def write_scene(scene: Scene, folder: Path, name: str, shell: ShellName = "none"
     """
     for ending in (".glb", ".png", ".json"):
         save_scene(scene, Path(folder) / f"{name}{ending}", shell)
-
-
-def check_free(folder: Path, overwrite: bool = False) -> None:
-    """Check that a folder can be written, and is empty unless `overwrite` is true."""
-    folder = Path(folder)
-    if folder.is_file():
-        raise InputError(f"{folder} is a file; name a folder.")
-    if not overwrite and folder.is_dir() and any(folder.iterdir()):
-        raise InputError(f"{folder} is not empty; add --overwrite or name another folder.")
-    check_writable(folder)
 
 
 def clear_scenes(folder: Path) -> None:

@@ -30,6 +30,7 @@ from sceneprior.apps.cli.options import (
     note_unmet,
     request_of,
 )
+from sceneprior.core.files import check_free
 
 BROKEN_TOLD = 5
 """Maximum number of broken models whose reasons `retrieve` prints."""
@@ -59,11 +60,11 @@ def synthesize(
 
     Without --shell, GLBs hold furniture only. Pictures of rooms with doors or windows show walls.
     """
+    check_free(out, overwrite)  # before imports that take seconds
     from sceneprior.apps.api import load
-    from sceneprior.apps.rooms import PAGE_FILE, check_free, write_scenes
+    from sceneprior.apps.rooms import PAGE_FILE, write_scenes
     from sceneprior.evaluation.rooms_page import write_rooms_page
 
-    check_free(out, overwrite)
     drawn = checked_shell(shell or "none")
     asked = request_of(floor, openings, ceiling, want, request)
     prior = load(run)
@@ -96,11 +97,11 @@ def interpolate(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Interpolate between two rooms on the sphere: rooms, a strip and an animation."""
+    check_free(out, overwrite)  # before imports that take seconds
     from sceneprior.apps.api import load
-    from sceneprior.apps.rooms import check_free, write_scenes
+    from sceneprior.apps.rooms import write_scenes
     from sceneprior.paper.interpolate import write_pictures
 
-    check_free(out, overwrite)
     prior = load(run)
     scenes = prior.interpolate(start, end, steps)
     write_scenes(scenes, out)
@@ -133,13 +134,13 @@ def complete(
     A requested floor, door, window or ceiling replaces the scene's; requested objects are added to
     the scene's. Without --shell, GLBs hold furniture only.
     """
+    check_free(out, overwrite)  # before imports that take seconds
     from dataclasses import replace
 
     from sceneprior.apps.api import load
-    from sceneprior.apps.rooms import check_free, write_scenes
+    from sceneprior.apps.rooms import write_scenes
     from sceneprior.render.scene_files import load_scene
 
-    check_free(out, overwrite)
     drawn = checked_shell(shell or "none")
     asked = request_of(floor, openings, ceiling, want, request)
     scene = load_scene(given, with_materials=True)
@@ -167,18 +168,18 @@ def retrieve(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Replace every object by the most similar CAD model of its class."""
+    check_free(out, overwrite)  # before imports that take seconds
     from rich.console import Console
     from rich.progress import track
 
     from sceneprior.apps.retrieval.cad_models import open_models
     from sceneprior.apps.retrieval.made_models import made_models
     from sceneprior.apps.retrieval.retrieve import retrieval_report, retrieve_all
-    from sceneprior.apps.rooms import check_free, write_scenes
+    from sceneprior.apps.rooms import write_scenes
     from sceneprior.core.files import write_json
     from sceneprior.evaluation.metrics.contents import common_label_set
     from sceneprior.render.scene_files import load_scene_folder
 
-    check_free(out, overwrite)
     console = Console(stderr=True)
     rooms = load_scene_folder(scenes)
     if models is None:

@@ -127,7 +127,8 @@ def export(
     For simulators, walls are added unless --shell says otherwise, and objects are moved until they
     stand and do not overlap.
     """
-    from sceneprior.apps.rooms import check_free, write_scenes
+    from sceneprior.apps.rooms import write_scenes
+    from sceneprior.core.files import check_free
     from sceneprior.interchange.box_lists import read_box_lists
     from sceneprior.interchange.export import export_scenes
     from sceneprior.render.scene_files import load_scene_folder

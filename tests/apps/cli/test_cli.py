@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -153,6 +154,17 @@ def test_what_a_command_could_not_write_is_named(command, toy_run, monkeypatch, 
     said = one_sentence(command(name, *run, *more, "target"))
     assert "target cannot be read or written (No space left on device); free space" in said
     assert not list(Path().iterdir())
+
+
+def test_a_folder_that_is_not_empty_is_noticed_before_torch_is_imported(tmp_path):
+    (tmp_path / "file").touch()
+    words = ["sceneprior", "synthesize", "--run", "demo-bedroom", "--out", str(tmp_path)]
+    code = (
+        f"import sys; sys.argv = {words!r}\nfrom sceneprior.apps import cli\n"
+        "try:\n    cli.main()\nfinally:\n    print('torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout == "False\n" and "is not empty; add --overwrite" in done.stderr
 
 
 @pytest.mark.parametrize("words", [("synthesize", "-n", 1, "--out"), ("make-homes",)])
