@@ -319,7 +319,7 @@ def tree_of(block: Block) -> dict[str, set[str]]:
     return drawn
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "CHANGELOG.md"], ids=name_of)
 def test_links_lead_somewhere(page: Path):
     links = re.findall(r"\]\(([^)\s]+)\)", page.read_text())
     for link in links:

@@ -1,4 +1,5 @@
-"""A built wheel works outside the repository: it carries the configs, the recipes, the page."""
+"""A built wheel works outside the repository: it carries the configs, the recipes, the page. An
+editable install works beside the clone, too."""
 
 import os
 import subprocess
@@ -26,6 +27,29 @@ def installed(tmp_path_factory) -> Path:
     target = folder / "site"
     subprocess.run([*pip, "install", "--no-deps", "--target", target, wheel], check=True)
     return target
+
+
+def test_an_editable_install_works_in_the_folder_that_holds_the_clone(tmp_path):
+    clone, prefix = tmp_path / "sceneprior", tmp_path / "prefix"
+    subprocess.run(["git", "clone", "-q", str(ROOT), str(clone)], check=True)
+    subprocess.run(
+        [sys.executable, "-m", "pip", "-q", "--disable-pip-version-check", "install", "--no-deps",
+         "--no-build-isolation", "--ignore-installed", "--prefix", prefix, "--editable", clone],
+        check=True,
+    )  # fmt: skip
+    (path_file,) = prefix.rglob("*.pth")
+    code = (
+        f"import site; site.addsitedir({str(path_file.parent)!r}); import sceneprior\n"
+        "from sceneprior.apps.config import load_config\n"
+        "assert load_config('bedroom.yaml').model.max_objects == 13\n"
+        "print(sceneprior.load.__module__, sceneprior.__file__)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True,
+        env={key: value for key, value in os.environ.items() if key != "PYTHONPATH"},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == f"sceneprior.apps.api {clone / 'sceneprior/__init__.py'}\n"
 
 
 def run(installed: Path, *arguments: str, cwd: Path) -> subprocess.CompletedProcess:

@@ -43,7 +43,8 @@ WITH_BASELINE_DECODERS = {
 def load_config(name: str, overrides: tuple[str, ...] = ()) -> RunConfig:
     """Read a config and apply `section.key=value` overrides."""
     path, data = read_settings(name, overrides)
-    return check_config(data, str(path))
+    changed = f" with {', '.join(map(shortened, overrides))}" if overrides else ""
+    return check_config(data, f"{path}{changed}")
 
 
 def check_config(data: dict[str, Any], source: str) -> RunConfig:

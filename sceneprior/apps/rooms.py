@@ -10,15 +10,14 @@ from jaxtyping import UInt8
 from rich.console import Console
 from rich.progress import Progress
 
-from sceneprior.core.errors import InputError
-from sceneprior.core.files import PARTS, check_writable, write_whole
+from sceneprior.core.files import PARTS, write_whole
 from sceneprior.core.scene import Scene
 from sceneprior.core.scene_json import FORMAT
 from sceneprior.core.shell import ShellName
 from sceneprior.paper.sampling import LATENTS_FILE, write_latents
 from sceneprior.render.pictures import contact_sheet, png_bytes
 from sceneprior.render.scene_files import check_names, format_of, save_scene
-from sceneprior.render.topdown import perspective, room_view
+from sceneprior.render.topdown import perspective, view_of
 
 PAGE_FILE = "rooms.html"
 OVERVIEW_ROOMS = 12
@@ -33,16 +32,6 @@ def write_scene(scene: Scene, folder: Path, name: str, shell: ShellName = "none"
     """
     for ending in (".glb", ".png", ".json"):
         save_scene(scene, Path(folder) / f"{name}{ending}", shell)
-
-
-def check_free(folder: Path, overwrite: bool = False) -> None:
-    """Check that a folder can be written, and is empty unless `overwrite` is true."""
-    folder = Path(folder)
-    if folder.is_file():
-        raise InputError(f"{folder} is a file; name a folder.")
-    if not overwrite and folder.is_dir() and any(folder.iterdir()):
-        raise InputError(f"{folder} is not empty; add --overwrite or name another folder.")
-    check_writable(folder)
 
 
 def clear_scenes(folder: Path) -> None:
@@ -84,10 +73,8 @@ def overview(
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Contact sheet of one or more rooms from above a corner, four per row, coloured by class.
 
-    If `shell` is `walls`, the walls behind the furniture are drawn; the floor is always drawn.
+    The walls behind the furniture are drawn if `shell` is `walls`, or the room has doors or
+    windows; the floor is always drawn.
     """
-    views = [room_view(scene, OVERVIEW_TILE) if shell == "walls" else None for scene in scenes]
-    tiles = [
-        perspective(scene, OVERVIEW_TILE, view) for scene, view in zip(scenes, views, strict=True)
-    ]
+    tiles = [perspective(scene, view=view_of(scene, OVERVIEW_TILE, shell)) for scene in scenes]
     return contact_sheet(tiles, min(4, len(tiles)))

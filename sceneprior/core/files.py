@@ -99,6 +99,16 @@ def check_writable(path: Path) -> None:
         _remove_empty(made)
 
 
+def check_free(folder: Path, overwrite: bool = False) -> None:
+    """Check that a folder can be written, and is empty unless `overwrite` is true."""
+    folder = Path(folder)
+    if folder.is_file():
+        raise InputError(f"{folder} is a file; name a folder.")
+    if not overwrite and folder.is_dir() and any(folder.iterdir()):
+        raise InputError(f"{folder} is not empty; add --overwrite or name another folder.")
+    check_writable(folder)
+
+
 @contextlib.contextmanager
 def only_writer(folder: Path) -> Iterator[None]:
     """Lock a folder for writing by this process, and create it if it is missing.

@@ -48,6 +48,9 @@ class Mesh:
                 f"{count - 1}."
             )
 
+    def __repr__(self) -> str:
+        return f"Mesh({len(self.vertices_m)} vertices, {len(self.faces)} faces)"
+
 
 def mesh_of_file(vertices_m: np.ndarray, faces: np.ndarray) -> Mesh:
     """Check a mesh read from a file: a valid `Mesh` with at least one triangle."""
@@ -96,9 +99,9 @@ class SceneObject:
     mesh: Mesh | None = None
     turned: Turned | None = None
     """Oriented box whose axis-aligned bounding box has `size_m`, if known."""
-    solids: tuple[Solid | Mesh, ...] = ()
+    solids: tuple[Solid | Mesh, ...] = field(default=(), repr=False)
     """Convex bodies whose union is the object, or contains it; none if they are not known."""
-    textured: tuple[Textured, ...] = ()
+    textured: tuple[Textured, ...] = field(default=(), repr=False)
     """The surface of `mesh` in parts with materials, for GLBs; none if it has the class colour."""
 
     def __post_init__(self) -> None:
@@ -198,6 +201,21 @@ class Scene:
     ceiling_m: float | None = None
     """Height of the ceiling above the floor; None if unknown."""
 
+    def __repr__(self) -> str:
+        """The name, the label set and the number of objects per class.
+
+        >>> Scene("empty", "front3d_bedroom")
+        Scene('empty', front3d_bedroom: no objects)
+        """
+        return f"Scene({self.name!r}, {self.label_set}: {self._contents})"
+
+    @property
+    def _contents(self) -> str:
+        """The classes of the objects, most frequent first, with their numbers."""
+        counted = Counter(item.label for item in self.objects).most_common()
+        words = [label if count == 1 else f"{label} ×{count}" for label, count in counted]
+        return ", ".join(words) or "no objects"
+
     @property
     def class_indices(self) -> np.ndarray:
         """Indices of the objects' classes in the label set, (objects,) int64."""
@@ -261,10 +279,8 @@ class Scene:
         """
         from sceneprior.render.pictures import png_bytes
 
-        counted = Counter(item.label for item in self.objects).most_common()
-        told = ", ".join(f"{count} {label}" for label, count in counted) or "no objects"
         picture = base64.b64encode(png_bytes(self.picture())).decode()
         return (
             f'<figure><img src="data:image/png;base64,{picture}" alt="a room">'
-            f"<figcaption>{html.escape(self.name)}: {told}</figcaption></figure>"
+            f"<figcaption>{html.escape(self.name)}: {self._contents}</figcaption></figure>"
         )

@@ -184,7 +184,8 @@ def _explain(model: type[Section], error: ValidationError, source: str) -> str:
     if first["type"] == "extra_forbidden":
         known = [field.alias or name for name, field in section.model_fields.items()]
         near = difflib.get_close_matches(location[-1], known, n=1, cutoff=0.0)
-        return f"{source}: unknown key '{key}'; the nearest valid key is '{near[0]}'.{more}"
+        valid = ".".join([*location[:-1], near[0]])
+        return f"{source}: unknown key '{key}'; the nearest valid key is '{valid}'.{more}"
     if first["type"] == "missing":
         return f"{source}: '{key}' is missing and has no default; add it.{more}"
     known_names = ", ".join(variants)

@@ -313,6 +313,7 @@ def list_shards(folder: Path, split: str) -> list[Path]:
         raise ShardError(f"No folder of shards at {folder}; make one with {PREPARE}.")
     paths = sorted((folder / split).glob("*.h5"))
     if not paths:
+        read_index(folder)  # a folder that is not one of shards has no index
         raise ShardError(
             f"The '{split}' split of {folder} holds no shards; prepare more rooms, or check the "
             f"split file given to {PREPARE}, and its report."

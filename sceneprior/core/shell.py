@@ -82,6 +82,17 @@ class Shell:
         named["ceiling"] = slab(self.outline_m, self.height_m, self.height_m + THICK_M)
         return named
 
+    def inner_meshes(self) -> dict[str, Mesh]:
+        """The floor, and the faces of walls and ceiling towards the room.
+
+        In viewers that draw front faces only, walls between the camera and the room are invisible.
+        The reveals of openings are left out: they would remain where their wall is invisible.
+        """
+        meshes = self.meshes()
+        towards = {f"wall_{row}": -np.insert(w.outward, 1, 0.0) for row, w in enumerate(self.walls)}
+        towards["ceiling"] = np.array([0.0, -1.0, 0.0])
+        return meshes | {name: _facing(meshes[name], way) for name, way in towards.items()}
+
 
 def shell_meshes(scene: Scene, shell: ShellName) -> dict[str, Mesh]:
     """The meshes of a scene's shell that `shell` selects, by name."""
@@ -287,6 +298,16 @@ def _within(wall: Wall, height_m: float) -> Wall:
 def slab(outline_m: Float[np.ndarray, "corners 2"], low_m: float, high_m: float) -> Mesh:
     """A closed mesh that fills an outline (x, z) between two heights."""
     return Mesh(*triangles_of(prism(outline_m, low_m, high_m)))
+
+
+def _facing(mesh: Mesh, direction: Float[np.ndarray, "3"]) -> Mesh:
+    """The faces of a mesh whose normals point in a direction, to 8 degrees."""
+    a, b, c = (mesh.vertices_m[mesh.faces[:, corner]] for corner in range(3))
+    normals = np.cross(b - a, c - a)
+    return Mesh(
+        mesh.vertices_m,
+        mesh.faces[normals @ direction > 0.99 * np.linalg.norm(normals, axis=1)],
+    )
 
 
 def _wall_mesh(

@@ -14,9 +14,10 @@ from PIL import Image
 from sceneprior import __version__
 from sceneprior.core.geometry.isosurface import decimate
 from sceneprior.core.scene import Mesh, Scene
+from sceneprior.core.shell import ShellName, shell_of
 from sceneprior.render.pictures import png_bytes
 from sceneprior.render.scene_files import scene_to_glb
-from sceneprior.render.topdown import corner_view
+from sceneprior.render.topdown import corner_view, shows_walls
 
 FACES_PER_PAGE = 100_000
 """Limit on the faces of all models of a page. A face takes 24 bytes, so a page has a few MB."""
@@ -48,8 +49,11 @@ def faces_per_object(scenes: Sequence[Scene]) -> int:
     return max(FACES_PER_PAGE // max(objects, 1), FEWEST_FACES)
 
 
-def glb_of(scene: Scene, most_faces: int) -> bytes:
-    """The room on its floor as a GLB, meshes decimated to about `most_faces` faces."""
+def glb_of(scene: Scene, most_faces: int, shell: ShellName = "none") -> bytes:
+    """The room on its floor as a GLB, meshes decimated to about `most_faces` faces.
+
+    With walls (see `shows_walls`), only their faces towards the room, so that none hides it.
+    """
     light = []
     for item in scene.objects:
         if item.mesh is not None:
@@ -57,7 +61,9 @@ def glb_of(scene: Scene, most_faces: int) -> bytes:
             mesh = Mesh(*decimate(vertices_m, np.asarray(item.mesh.faces), most_faces))
             item = replace(item, mesh=mesh, textured=())
         light.append(item)
-    return scene_to_glb(replace(scene, objects=tuple(light)), {"floor": corner_view([scene]).floor})
+    floor = {"floor": corner_view([scene]).floor}
+    room = shell_of(scene).inner_meshes() if shows_walls(scene, shell) else floor
+    return scene_to_glb(replace(scene, objects=tuple(light)), room)
 
 
 def png_uri(image: Image.Image) -> str:

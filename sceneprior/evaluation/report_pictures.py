@@ -14,9 +14,11 @@ from sceneprior.core.classes import label_set
 from sceneprior.core.palette import quiet_colors
 from sceneprior.core.scene import Scene
 from sceneprior.core.shards import Shard, iterate_rooms
+from sceneprior.core.shell import ShellName
 from sceneprior.evaluation.page import data_uri, glb_of, png_uri
+from sceneprior.render.floor_plans import plan_of
 from sceneprior.render.pictures import paint_ids
-from sceneprior.render.topdown import perspective, topdown
+from sceneprior.render.topdown import perspective, topdown_protocol, view_of
 
 _POINTS_PER_CURVE = 400
 _EMPTY = (244, 245, 247)
@@ -30,27 +32,28 @@ class RoomPictures:
     contents: str
     """The scene's objects in words: "double bed, nightstand ×2"."""
     topdown: str
-    """Data URI of the flat top-down picture, with borders and in muted colours, at half size."""
+    """Data URI of the plan from straight above, at half size and the same scale for all rooms."""
     perspective: str
     """Data URI of the shaded view from above a corner."""
     glb: str
     """Data URI of the 3D model that replaces the shaded view; empty if none was requested."""
 
 
-def room_pictures(scene: Scene, most_faces: int = 0) -> RoomPictures:
-    """Draw a scene's top-down and corner view, and export its 3D model.
+def room_pictures(scene: Scene, most_faces: int = 0, shell: ShellName = "none") -> RoomPictures:
+    """Draw a scene's plan and corner view, and export its 3D model.
 
-    `most_faces` limits the faces of each object's mesh; 0 leaves the model out.
+    View and model have walls if `shell` is `walls`, or the room has doors or windows. `most_faces`
+    limits the faces of each object's mesh; 0 leaves the model out.
     """
     counts = Counter(item.label.replace("_", " ") for item in scene.objects)
     words = [name if many == 1 else f"{name} ×{many}" for name, many in sorted(counts.items())]
-    flat = Image.fromarray(topdown(scene, outlines=True))
+    flat = plan_of(scene, np.zeros(2), topdown_protocol(scene.label_set).window_m)
     flat = flat.resize((256, 256), Image.Resampling.BOX)
     solid = io.BytesIO()
-    shaded = Image.fromarray(perspective(scene, (330, 440)))
+    shaded = Image.fromarray(perspective(scene, view=view_of(scene, (330, 440), shell)))
     shaded.save(solid, format="JPEG", quality=86, optimize=True)
     solid_uri = data_uri("image/jpeg", solid.getvalue())
-    glb = data_uri("model/gltf-binary", glb_of(scene, most_faces)) if most_faces else ""
+    glb = data_uri("model/gltf-binary", glb_of(scene, most_faces, shell)) if most_faces else ""
     contents = ", ".join(words) or "nothing"
     return RoomPictures(scene.name, contents, png_uri(flat.quantize(64)), solid_uri, glb)
 

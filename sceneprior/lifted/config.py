@@ -1,6 +1,7 @@
 """Settings of a run of the lifted method, and its stages, from opened data to a module."""
 
 import contextlib
+import warnings
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
@@ -9,7 +10,7 @@ import torch
 from pydantic import Field, model_validator
 from torch import nn
 
-from sceneprior.core.errors import ShardError
+from sceneprior.core.errors import InputWarning, ShardError
 from sceneprior.core.settings import Section
 from sceneprior.core.shards import list_shards
 from sceneprior.lifted.lifting.dataset import LiftedDataset
@@ -28,6 +29,10 @@ from sceneprior.training.method import Stage, ready_copy
 if TYPE_CHECKING:
     from sceneprior.lifted.sampler.stage import SamplerStage
     from sceneprior.lifted.stages import LiftedStage
+
+
+FEW_ROOMS = 24
+"""Number of training rooms below which training warns: docs/captures.md advises a few dozen."""
 
 
 class LiftedLossConfig(Section):
@@ -154,6 +159,13 @@ class LiftedConfig(PriorConfig):
         # Imported here and below, only where something is trained: Lightning takes seconds.
         from sceneprior.lifted.stages import LiftedStage
 
+        if (count := len(rooms.plain_ids)) < FEW_ROOMS:
+            warnings.warn(
+                f"The train split has only {count} room{'s' * (count > 1)}, so new rooms will be "
+                f"implausible; prepare at least {FEW_ROOMS}, better a few hundred.",
+                InputWarning,
+                stacklevel=2,
+            )
         prior, latents = self.build_prior(), self.build_latents(len(rooms))
         assert isinstance(prior.shape, LookDecoder)
         prior.shape.learn_prototypes(rooms.find_prototypes(self.model.shape.prototypes))

@@ -28,6 +28,14 @@ def floor_plan(scene: Scene) -> UInt8[np.ndarray, "512 662 3"]:
     it. To the right stand a legend of the classes and a scale bar.
     """
     center, side_m = _window(scene)
+    picture = Image.new("RGB", (PLAN_PX + LEGEND_PX, PLAN_PX), BACKGROUND)
+    picture.paste(plan_of(scene, center, side_m))
+    _legend(ImageDraw.Draw(picture), scene, PLAN_PX / side_m)
+    return np.asarray(picture)
+
+
+def plan_of(scene: Scene, center: Float[np.ndarray, "2"], side_m: float) -> Image.Image:
+    """Draw the square of a room around `center` (x, z), without a legend, 512 x 512 pixels."""
     scale = PLAN_PX / side_m
     ids = np.zeros((PLAN_PX, PLAN_PX), dtype=np.uint16)
     colors = object_colors(scene)
@@ -52,10 +60,7 @@ def floor_plan(scene: Scene) -> UInt8[np.ndarray, "512 662 3"]:
         draw.line(ends, fill=DOOR if opening.kind == "door" else WINDOW, width=7)
     painted = Image.fromarray(paint_ids(ids, colors, BACKGROUND))
     plan.paste(painted, mask=Image.fromarray(np.uint8(255) * (ids > 0)))
-    picture = Image.new("RGB", (PLAN_PX + LEGEND_PX, PLAN_PX), BACKGROUND)
-    picture.paste(plan)
-    _legend(ImageDraw.Draw(picture), scene, colors, scale)
-    return np.asarray(picture)
+    return plan
 
 
 def _window(scene: Scene) -> tuple[Float[np.ndarray, "2"], float]:
@@ -69,17 +74,12 @@ def _window(scene: Scene) -> tuple[Float[np.ndarray, "2"], float]:
     return (low + high) / 2, side_m
 
 
-def _legend(
-    draw: ImageDraw.ImageDraw,
-    scene: Scene,
-    colors: UInt8[np.ndarray, "objects 3"],
-    scale: float,
-) -> None:
+def _legend(draw: ImageDraw.ImageDraw, scene: Scene, scale: float) -> None:
     """Draw a square and a name for each class and kind of opening, and the scale bar below."""
     font = ImageFont.load_default(size=FONT_PX)
     labels = [item.label for item in scene.objects]
     rows: dict[str, tuple[int, ...]] = {}
-    for label, color in sorted(zip(labels, colors.tolist(), strict=True)):
+    for label, color in sorted(zip(labels, object_colors(scene).tolist(), strict=True)):
         count = labels.count(label)
         rows[f"{label} x {count}" if count > 1 else label] = tuple(color)
     for kind, color in (("door", DOOR), ("window", WINDOW)):

@@ -157,8 +157,9 @@ def _add(
         baseColorFactor=linear_rgba(color),
         metallicFactor=0.0,
         roughnessFactor=0.9,
-        # A learned mesh may fold over itself, and its back faces should be visible.
-        doubleSided=True,
+        # A learned mesh may fold over itself, so its back faces are drawn. Walls are closed, or
+        # should be invisible from behind.
+        doubleSided=not is_shell(node),
     )
     geometry = trimesh.Trimesh(
         np.asarray(part.mesh.vertices_m, dtype=np.float64),

@@ -11,7 +11,7 @@ from sceneprior.core.floor import floor_rectangle
 from sceneprior.core.geometry.corners import BOX_FACES, box_corners
 from sceneprior.core.palette import quiet_colors
 from sceneprior.core.scene import Mesh, Scene, SceneObject
-from sceneprior.core.shell import rectangle, shell_of, slab
+from sceneprior.core.shell import ShellName, rectangle, shell_of, slab
 from sceneprior.render.offscreen import Orthographic, Pinhole, SoftwareRenderer
 from sceneprior.render.pictures import paint_ids
 
@@ -149,6 +149,18 @@ class CornerView:
     """Walls of a single room that lie behind its furniture, as seen from the camera."""
 
 
+def shows_walls(scene: Scene, shell: ShellName) -> bool:
+    """True if pictures of a room show walls: if `shell` does, or the room has doors or windows."""
+    return shell == "walls" or bool(scene.openings)
+
+
+def view_of(scene: Scene, image_size: tuple[int, int], shell: ShellName = "none") -> CornerView:
+    """The view of a single room, with walls according to `shows_walls`."""
+    if shows_walls(scene, shell):
+        return room_view(scene, image_size)
+    return corner_view([scene], image_size)
+
+
 def room_view(scene: Scene, image_size: tuple[int, int] = (360, 480)) -> CornerView:
     """A view of a room from outside, above a corner, that just contains it.
 
@@ -210,10 +222,10 @@ def perspective(
     """Draw a room with soft shadows, seen from outside and above a corner. Report pages show these
     pictures; no metric uses them.
 
-    If `view` is None, a view of `image_size` is fitted to the room; with a common view, pictures of
-    several rooms can be compared. If `colors` is None, objects have the colours of their classes.
+    If `view` is None, `view_of` fits one of `image_size` to the room; with a common view, pictures
+    of several rooms can be compared. If `colors` is None, objects have their classes' colours.
     """
-    view = view or corner_view([scene], image_size)
+    view = view or view_of(scene, image_size)
     colors = object_colors(scene) if colors is None else colors
     walls = [WALL_COLOR] * len(view.walls)
     colors = np.concatenate([colors, [FLOOR_COLOR], *([walls] if walls else [])]).astype(np.uint8)

@@ -8,7 +8,7 @@ import torch
 
 import sceneprior
 from sceneprior.core.errors import InputError
-from sceneprior.core.scene import Scene, SceneObject
+from sceneprior.core.scene import Mesh, Scene, SceneObject
 
 BED = SceneObject("double_bed", (0.2, 0.3, -0.9), (1.7, 0.6, 2.1))
 
@@ -53,11 +53,22 @@ def test_other_endings_are_a_sentence(tmp_path):
         Scene("mine", "front3d_bedroom").save(tmp_path / "room.stl")
 
 
+def test_a_printed_room_is_one_line():
+    mesh = Mesh(np.zeros((4, 3)), np.zeros((2, 3), dtype=np.int64))
+    lamp = SceneObject("pendant_lamp", (0.0, 2.0, 0.0), (1.0, 1.0, 1.0), mesh, solids=(mesh,) * 9)
+    room = Scene("mine", "front3d_bedroom", (lamp, BED, BED), np.zeros((50, 2)), {"seed": 1})
+    assert repr(room) == "Scene('mine', front3d_bedroom: double_bed ×2, pendant_lamp)"
+    assert repr(lamp) == (
+        "SceneObject(label='pendant_lamp', center_m=(0.0, 2.0, 0.0), size_m=(1.0, 1.0, 1.0), "
+        "mesh=Mesh(4 vertices, 2 faces), turned=None)"
+    )
+
+
 def test_a_notebook_shows_the_picture(monkeypatch):
     room = Scene("my <room>", "front3d_bedroom", (BED, BED))
     shown = []
     page = room._repr_html_()
-    assert "data:image/png;base64," in page and "my &lt;room&gt;: 2 double_bed" in page
+    assert "data:image/png;base64," in page and "my &lt;room&gt;: double_bed ×2" in page
     with pytest.raises(InputError, match="draws in a notebook, and this is none"):
         room.show()
     notebook = SimpleNamespace(get_ipython=object, display=SimpleNamespace(display=shown.append))

@@ -162,7 +162,7 @@ def test_commands_take_requests(command, tmp_path):
     make = ["synthesize", "--run", "procthor-bedroom", "-n", "1", "--out", tmp_path / "rooms"]
     want = "a 4 x 3 m bedroom with a door and two nightstands"
     status, told, errors = command(*make, "--want", want)
-    assert status == 0 and "Wrote 1 rooms" in told, errors
+    assert status == 0 and "All wishes hold in 1 room\nWrote 1 room to" in told, errors
     room = sceneprior.load_scene(tmp_path / "rooms" / "seed0_0000.json")
     assert [item.label for item in room.objects].count("nightstand") == 2
     assert [each.kind for each in room.openings] == ["door"]

@@ -243,10 +243,12 @@ def test_other_formats_and_missing_files(tmp_path):
 def test_folders(tmp_path):
     with pytest.raises(ShardError, match="No folder of shards at"):
         list_shards(tmp_path / "none", "train")
+    for read in (read_index, lambda folder: list_shards(folder, "test")):
+        with pytest.raises(ShardError, match=r"has no index\.json; it is not a finished folder"):
+            read(tmp_path)
+    (tmp_path / "index.json").write_text("{}")
     with pytest.raises(ShardError, match=r"The 'test' split of .* holds no shards"):
         list_shards(tmp_path, "test")
-    with pytest.raises(ShardError, match=r"has no index\.json; it is not a finished folder"):
-        read_index(tmp_path)
     (tmp_path / "index.json").write_text('{"a"')
     with pytest.raises(ShardError, match="is not JSON"):
         read_index(tmp_path)

@@ -57,6 +57,22 @@ def test_doors_and_windows_are_holes():
         assert solid(shell, name).is_volume
 
 
+def test_inner_faces_point_into_the_room_and_cover_its_walls():
+    shell = shell_of(room(SLANTED[::-1], openings=(WINDOW,)))
+    inner = {name: trimesh.Trimesh(*vars(m).values()) for name, m in shell.inner_meshes().items()}
+    whole = solid(shell, "floor")
+    assert inner["floor"].area == whole.area
+    assert inner["ceiling"].area == pytest.approx(shapely.Polygon(SLANTED).area)
+    np.testing.assert_allclose(inner["ceiling"].face_normals[:, 1], -1.0)
+    for row, wall in enumerate(shell.walls):
+        mesh = inner[f"wall_{row}"]
+        holes = sum((end - start) * (top - low) for start, end, low, top in wall.openings)
+        # From the lower face of the floor to the upper face of the ceiling.
+        height_m = shell.height_m + 2 * THICK_M
+        assert mesh.area == pytest.approx(wall.length_m * height_m - holes)
+        np.testing.assert_allclose(mesh.face_normals[:, ::2] @ wall.outward, -1.0, atol=1e-6)
+
+
 def test_panels_fill_the_walls_round_their_openings():
     """Panels as boxes lie in the wall's mesh, and their areas add up."""
     shell = shell_of(room(SLANTED, openings=(DOOR, WINDOW)))

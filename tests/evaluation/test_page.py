@@ -3,6 +3,7 @@
 import base64
 import hashlib
 import io
+import json
 import re
 import time
 from dataclasses import replace
@@ -16,7 +17,7 @@ from PIL import Image
 import sceneprior.evaluation
 from sceneprior.core.geometry.corners import BOX_FACES
 from sceneprior.core.geometry.isosurface import surface_of
-from sceneprior.core.scene import Mesh, Scene, SceneObject
+from sceneprior.core.scene import Mesh, Opening, Scene, SceneObject
 from sceneprior.evaluation.page import FACES_PER_PAGE, faces_per_object, glb_of
 from sceneprior.evaluation.rooms_page import ROOMS_SHOWN, write_rooms_page
 
@@ -130,6 +131,17 @@ def test_rooms_share_the_faces_of_a_page():
     faces = len(bedroom().objects[1].mesh.faces)
     # A closed mesh has half as many vertices as faces: 12 bytes a face, and 12 for each half.
     assert len(whole) - len(light) == pytest.approx((faces - 300) * 18, rel=0.05)
+
+
+def test_walls_of_a_model_are_seen_from_inside_only():
+    outline = np.array([[-2.0, -2.0], [2.0, -2.0], [2.0, 2.0], [-2.0, 2.0]])
+    door = Opening("door", (-0.5, -2.0), (0.5, -2.0), 0.0, 2.0)
+    room = replace(bedroom(), floor_m=outline)
+    for walled in (glb_of(replace(room, openings=(door,)), 300), glb_of(room, 300, "walls")):
+        model = json.loads(walled[20 : 20 + int.from_bytes(walled[12:16], "little")])
+        sides = {each["name"]: each.get("doubleSided", False) for each in model["materials"]}
+        assert not sides["wall"] and not sides["ceiling"] and sides["double_bed"]
+    assert b"wall_0" not in glb_of(room, 300)
 
 
 def test_boxes_are_drawn_whole(tmp_path):

@@ -13,11 +13,13 @@ from toy_metrics import without_classifiers
 
 from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.palette import quiet_colors
-from sceneprior.core.scene import Scene, SceneObject
+from sceneprior.core.scene import Opening, Scene, SceneObject
 from sceneprior.evaluation.report import write_report
 from sceneprior.evaluation.report_pictures import input_views, legend, room_pictures
 from sceneprior.evaluation.rooms_page import write_rooms_page
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
+from sceneprior.render.floor_plans import DOOR
+from sceneprior.render.topdown import FLOOR_COLOR
 
 
 @pytest.fixture(scope="module")
@@ -146,6 +148,20 @@ def test_room_pictures_count_in_words():
     assert room_pictures(replace(room, objects=())).contents == "nothing"
     assert [name for name, _ in legend([room])] == ["double bed", "stool"]
     assert legend([room])[0][1] == "#" + bytes(quiet_colors(["double_bed"])[0].tolist()).hex()
+
+
+def test_pictures_of_rooms_with_a_floor_and_a_door_show_them():
+    outline = np.array([[-1.6, -1.6], [1.6, -1.6], [1.6, 1.6], [-1.6, 1.6]])
+    room = Scene("a", "front3d_bedroom", floor_m=outline)
+    door = Opening("door", (-1.6, -0.5), (-1.6, 0.5), 0.0, 2.0)
+    plan = decode(room_pictures(room).topdown)
+    # 3.2 m are half of the window of 6.4 m, and the picture has 256 pixels.
+    assert plan.shape == (256, 256, 3) and (np.abs(plan[128, 128] - FLOOR_COLOR) <= 4).all()
+    assert plan[128, 60].min() > 250 and plan[128, 64].max() < 150 and plan[60, 128].min() > 250
+    walled = room_pictures(replace(room, openings=(door,)))
+    assert (np.abs(decode(walled.topdown)[128, 64] - DOOR) <= 8).all()
+    shown = [room_pictures(room), room_pictures(room, shell="walls"), walled]
+    assert len({each.perspective for each in shown}) == 3
 
 
 def test_a_page_of_a_stranger_s_rooms_runs_nothing(tmp_path):

@@ -18,6 +18,7 @@ _ADVICE = {
     errno.EROFS: "name a folder that can be written",
     errno.EACCES: "change its permissions, or name another folder",
     errno.EPERM: "change its permissions, or name another folder",
+    errno.ENOENT: "check the path, or name another folder",
     errno.ENOTDIR: "a file is where a folder is needed; name another folder",
     errno.EEXIST: "a file is where a folder is needed; name another folder",
     errno.EISDIR: "a folder is where a file is needed; name another file",

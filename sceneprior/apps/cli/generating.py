@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from sceneprior.apps.cli.messages import rooms_in_words
 from sceneprior.apps.cli.options import (
     MODELS_HELP,
     OWN_HELP,
@@ -29,6 +30,7 @@ from sceneprior.apps.cli.options import (
     note_unmet,
     request_of,
 )
+from sceneprior.core.files import check_free
 
 BROKEN_TOLD = 5
 """Maximum number of broken models whose reasons `retrieve` prints."""
@@ -56,13 +58,13 @@ def synthesize(
 ) -> None:
     """Generate rooms: JSON, GLB and a top-down PNG each, and latents if the method has them.
 
-    Without --shell, GLBs hold furniture only.
+    Without --shell, GLBs hold furniture only. Pictures of rooms with doors or windows show walls.
     """
+    check_free(out, overwrite)  # before imports that take seconds
     from sceneprior.apps.api import load
-    from sceneprior.apps.rooms import PAGE_FILE, check_free, write_scenes
+    from sceneprior.apps.rooms import PAGE_FILE, write_scenes
     from sceneprior.evaluation.rooms_page import write_rooms_page
 
-    check_free(out, overwrite)
     drawn = checked_shell(shell or "none")
     asked = request_of(floor, openings, ceiling, want, request)
     prior = load(run)
@@ -72,8 +74,8 @@ def synthesize(
     origin = distribution or prior.distribution
     if html:
         told = f"run {Path(run).resolve().name} · seed {seed} · from: {origin}"
-        write_rooms_page(out / PAGE_FILE, scenes, title="New rooms", subtitle=told)
-    typer.echo(f"Wrote {count} rooms to {out} (from: {origin})")
+        write_rooms_page(out / PAGE_FILE, scenes, title="New rooms", subtitle=told, shell=drawn)
+    typer.echo(f"Wrote {rooms_in_words(count)} to {out} (from: {origin})")
     if empty := [scene.name for scene in scenes if not scene.objects]:
         more = f" and {len(empty) - EMPTY_TOLD} more" * (len(empty) > EMPTY_TOLD)
         typer.echo(
@@ -95,11 +97,11 @@ def interpolate(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Interpolate between two rooms on the sphere: rooms, a strip and an animation."""
+    check_free(out, overwrite)  # before imports that take seconds
     from sceneprior.apps.api import load
-    from sceneprior.apps.rooms import check_free, write_scenes
+    from sceneprior.apps.rooms import write_scenes
     from sceneprior.paper.interpolate import write_pictures
 
-    check_free(out, overwrite)
     prior = load(run)
     scenes = prior.interpolate(start, end, steps)
     write_scenes(scenes, out)
@@ -132,13 +134,13 @@ def complete(
     A requested floor, door, window or ceiling replaces the scene's; requested objects are added to
     the scene's. Without --shell, GLBs hold furniture only.
     """
+    check_free(out, overwrite)  # before imports that take seconds
     from dataclasses import replace
 
     from sceneprior.apps.api import load
-    from sceneprior.apps.rooms import check_free, write_scenes
+    from sceneprior.apps.rooms import write_scenes
     from sceneprior.render.scene_files import load_scene
 
-    check_free(out, overwrite)
     drawn = checked_shell(shell or "none")
     asked = request_of(floor, openings, ceiling, want, request)
     scene = load_scene(given, with_materials=True)
@@ -148,8 +150,9 @@ def complete(
     scenes = prior.complete(scene, count, seed, distribution, wanted, **asked, cad=cad)
     write_scenes(scenes, out, drawn)
     note_unmet(scenes)
+    given_objects = f"{len(scene.objects)} given object{'s' * (len(scene.objects) != 1)}"
     how = "drawn by the sampler" if scenes[0].latent is None else "decoded from fitted latents"
-    typer.echo(f"Wrote {count} rooms around {len(scene.objects)} given objects, {how}, to {out}")
+    typer.echo(f"Wrote {rooms_in_words(count)} around {given_objects}, {how}, to {out}")
     for room in scenes:
         if lacking := room.extra.get("no_place"):
             typer.echo(f"Note: {room.name} has no place for {', '.join(lacking)}.", err=True)
@@ -165,18 +168,18 @@ def retrieve(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Replace every object by the most similar CAD model of its class."""
+    check_free(out, overwrite)  # before imports that take seconds
     from rich.console import Console
     from rich.progress import track
 
     from sceneprior.apps.retrieval.cad_models import open_models
     from sceneprior.apps.retrieval.made_models import made_models
     from sceneprior.apps.retrieval.retrieve import retrieval_report, retrieve_all
-    from sceneprior.apps.rooms import check_free, write_scenes
+    from sceneprior.apps.rooms import write_scenes
     from sceneprior.core.files import write_json
     from sceneprior.evaluation.metrics.contents import common_label_set
     from sceneprior.render.scene_files import load_scene_folder
 
-    check_free(out, overwrite)
     console = Console(stderr=True)
     rooms = load_scene_folder(scenes)
     if models is None:
@@ -200,4 +203,4 @@ def retrieve(
         typer.echo(f"{len(broken)} models are broken; see retrieval.json")
     for reason in [*broken.values()][:BROKEN_TOLD]:
         typer.echo(f"Note: {reason}.", err=True)
-    typer.echo(f"Wrote {len(made)} rooms to {out}")
+    typer.echo(f"Wrote {rooms_in_words(len(made))} to {out}")

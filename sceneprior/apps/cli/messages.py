@@ -9,6 +9,11 @@ from typing import Any
 from sceneprior.core.errors import InputWarning
 
 
+def rooms_in_words(count: int) -> str:
+    """The number of rooms: `1 room`, `2 rooms`."""
+    return "1 room" if count == 1 else f"{count} rooms"
+
+
 @contextmanager
 def warnings_as_sentences() -> Iterator[None]:
     """Print each `InputWarning` without the source line that Python adds."""

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from sceneprior.apps.cli.messages import rooms_in_words
 from sceneprior.core.errors import InputError
 from sceneprior.core.seeds import LARGEST_SEED
 
@@ -103,7 +104,10 @@ def request_of(
 
 
 def note_unmet(scenes: Sequence["Scene"]) -> None:
-    """Print the wishes that each room does not fulfil."""
+    """Print the wishes that each room does not fulfil, or that all wishes hold."""
+    wishes = [each for room in scenes for each in room.extra.get("wishes", [])]
+    if wishes and all(each["holds"] for each in wishes):
+        typer.echo(f"All wishes hold in {rooms_in_words(len(scenes))}")
     for room in scenes:
         unmet = [each["wish"] for each in room.extra.get("wishes", []) if not each["holds"]]
         if unmet:

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from sceneprior.apps.cli.messages import rooms_in_words
 from sceneprior.apps.cli.options import (
     MODELS_HELP,
     OverwriteOption,
@@ -63,8 +64,8 @@ def reconstruct(
     from sceneprior.apps.reconstruction.export import write_page, write_reconstructions
     from sceneprior.apps.reconstruction.own_image import read_own_image
     from sceneprior.apps.reconstruction.reconstruct import OBJECTS
-    from sceneprior.apps.rooms import check_free
     from sceneprior.core.errors import InputError
+    from sceneprior.core.files import check_free
     from sceneprior.core.geometry.turns import QUARTERS
     from sceneprior.core.observed_image import image_from_shards, images_of_split
 
@@ -113,7 +114,7 @@ def reconstruct(
     write_reconstructions(found, out)
     if mask is not None:
         write_page(found[0], out)
-    typer.echo(f"Wrote {len(found)} room{'s' * (len(found) != 1)} to {out}")
+    typer.echo(f"Wrote {rooms_in_words(len(found))} to {out}")
 
 
 def eval_svr(

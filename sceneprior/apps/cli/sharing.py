@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from sceneprior.apps.cli.messages import rooms_in_words
 from sceneprior.apps.cli.options import OverwriteOption, ShellOption, checked_shell
 from sceneprior.core.errors import InputError
 
@@ -126,7 +127,8 @@ def export(
     For simulators, walls are added unless --shell says otherwise, and objects are moved until they
     stand and do not overlap.
     """
-    from sceneprior.apps.rooms import check_free, write_scenes
+    from sceneprior.apps.rooms import write_scenes
+    from sceneprior.core.files import check_free
     from sceneprior.interchange.box_lists import read_box_lists
     from sceneprior.interchange.export import export_scenes
     from sceneprior.render.scene_files import load_scene_folder
@@ -144,4 +146,4 @@ def export(
         asked = None if shell is None else checked_shell(shell)
         for note in export_scenes(rooms, to, out, asked):
             typer.echo(f"Note: {note}", err=True)
-    typer.echo(f"Wrote {len(rooms)} rooms to {out}")
+    typer.echo(f"Wrote {rooms_in_words(len(rooms))} to {out}")

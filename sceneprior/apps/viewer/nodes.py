@@ -8,7 +8,7 @@ import numpy as np
 
 from sceneprior.core.geometry.corners import BOX_EDGES, box_corners
 from sceneprior.core.scene import Mesh, Scene, SceneObject
-from sceneprior.core.shell import THICK_M, ShellName, shell_meshes, shell_of
+from sceneprior.core.shell import ShellName, shell_meshes, shell_of
 from sceneprior.render.topdown import object_colors, object_mesh, shell_color
 
 if TYPE_CHECKING:
@@ -74,7 +74,9 @@ class RoomNodes:
     ) -> None:
         """Show a scene in place of the previous one; objects that the user keeps get an orange box
         and a name. If neither floor nor walls are shown, a grid is."""
-        self._show_shell(shown_shell(scene, shell))
+        self._show_shell(
+            shell_of(scene).inner_meshes() if shell == "walls" else shell_meshes(scene, shell)
+        )
         for row, (item, color) in enumerate(
             zip(scene.objects, object_colors(scene).tolist(), strict=True)
         ):
@@ -147,37 +149,6 @@ class RoomNodes:
                 np.repeat(colors, 2 * len(_EDGES), axis=0).reshape(-1, 2, 3), thickness=2,
                 thickness_units="screen",
             )  # fmt: skip
-
-
-def shown_shell(scene: Scene, shell: ShellName) -> dict[str, Mesh]:
-    """Floor, walls and ceiling as seen from inside the room, with the frames of its openings.
-
-    Only faces towards the room are kept, and browsers draw only front faces. So walls between the
-    camera and the room are invisible, except for the frames of their doors and windows.
-    """
-    meshes = shell_meshes(scene, shell)
-    if shell != "walls":
-        return meshes
-    room = shell_of(scene)
-    ceiling_m = room.height_m + THICK_M / 2
-    for row, wall in enumerate(room.walls):
-        mesh = meshes[f"wall_{row}"]
-        outward = _normals(mesh) @ np.insert(wall.outward, 1, 0.0)
-        # Keep the inner face and the reveals of openings; drop the edges and the mitred ends.
-        y = mesh.vertices_m[mesh.faces].mean(axis=1)[:, 1]
-        reveal = (abs(outward) < 0.01) & (y > -THICK_M / 2) & (y < ceiling_m)
-        meshes[f"wall_{row}"] = Mesh(mesh.vertices_m, mesh.faces[(outward < -0.99) | reveal])
-    ceiling = meshes["ceiling"]
-    below = _normals(ceiling)[:, 1] < -0.99
-    meshes["ceiling"] = Mesh(ceiling.vertices_m, ceiling.faces[below])
-    return meshes
-
-
-def _normals(mesh: Mesh) -> np.ndarray:
-    """Unit normals of a mesh's faces."""
-    a, b, c = (mesh.vertices_m[mesh.faces[:, corner]] for corner in range(3))
-    normals = np.cross(b - a, c - a)
-    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12))
 
 
 def _alike(old: _Node, unit: np.ndarray, faces: np.ndarray, color: tuple[int, int, int]) -> bool:

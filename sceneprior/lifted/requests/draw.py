@@ -12,7 +12,7 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.requests.particles import PARTICLES, Particles, start_particles
 from sceneprior.lifted.requests.placement_rules import PlacementRules
-from sceneprior.lifted.requests.plans import RoomPlan, check_area, plan_room
+from sceneprior.lifted.requests.plans import RoomPlan, check_area, plan_room, warn_of_area
 from sceneprior.lifted.requests.relation_checks import furniture_in
 from sceneprior.lifted.requests.request import Request
 from sceneprior.lifted.requests.shape import RoomShape
@@ -64,6 +64,7 @@ def draw_requested(
         sampler.max_objects,
     )  # fmt: skip
     check_area(sampler, request, classes)
+    warn_of_area(sampler, request)
     given = _given(sampler, request, classes, seed)
     answers: list[Answer | None] = [None] * count
     rejections: Rejections = Counter()

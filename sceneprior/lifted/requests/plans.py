@@ -1,11 +1,12 @@
 """Plans of requested rooms: shape, classes to add and their order, drawn before any object."""
 
+import warnings
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
-from sceneprior.core.errors import InputError
+from sceneprior.core.errors import InputError, InputWarning
 from sceneprior.core.shell import rectangle
 from sceneprior.lifted.requests.contents import draw_contents, required_rows
 from sceneprior.lifted.requests.openings import place_openings
@@ -21,6 +22,10 @@ FULL_SHARE = 0.5
 CROWDED_SHARE = 1.2
 """Share of a requested floor above which the smallest footprints of required objects are assumed
 not to fit. It is above 1, because some objects may overlap, such as a chair and a table."""
+
+
+UNUSUAL = 0.001
+"""Probability of drawing a smaller or larger floor below which a requested floor is unusual."""
 
 
 class RoomPlan(NamedTuple):
@@ -78,6 +83,27 @@ def _drawn_outline(
         reach = (np.abs(boxes_m[:, [0, 2]]) + boxes_m[:, [3, 5]] / 2).max(axis=0)
         half = np.maximum(half, reach)
     return rectangle(-half, half)
+
+
+def warn_of_area(sampler: RoomSampler, request: Request) -> None:
+    """Warn if hardly any floor that the sampler draws is as small, or as large, as the requested
+    one: the network extrapolates there, and the usual furniture may not fit."""
+    if request.outline_m is None:
+        return
+    area_m2 = RoomShape(request.outline_m).polygon.area
+    # The logarithm of an area is the sum of those of its extents, so it is normal, too.
+    mean = sampler.rectangle_means[:, 2:].sum(dim=1)
+    deviation = sampler.rectangle_factors[:, 2:].sum(dim=1).norm(dim=1)
+    below = torch.special.ndtr((float(np.log(area_m2)) - mean) / deviation)
+    smaller = float((sampler.rectangle_logits.softmax(dim=0) * below).sum())
+    for share, word in ((smaller, "smaller"), (1 - smaller, "larger")):
+        if share < UNUSUAL:
+            warnings.warn(
+                f"The floor of {area_m2:.1f} square metres is {word} than in nearly all training "
+                "rooms of this prior, so rooms on it may lack the usual furniture.",
+                InputWarning,
+                stacklevel=2,
+            )
 
 
 def check_area(sampler: RoomSampler, request: Request, classes: tuple[str, ...]) -> None:

@@ -85,9 +85,11 @@ def read_sentence(text: str, known: Sequence[str], label_set: str) -> Sentence:
     reader = _Reader(tokens, known, label_set)
     reader.read()
     if reader.strange:
-        # Relation words are left out if another word is unknown: usually it is their target.
-        fine = {*ARTICLES, *RELATION_WORDS}
-        listed = [word for word in reader.strange if word not in fine] or reader.strange
+        # If another word is unknown, words before a noun are left out: usually it is their noun.
+        fine = {*ARTICLES, *RELATION_WORDS, *NUMBERS, *" ".join(BOUNDS).split()}
+        listed = [
+            word for word in reader.strange if not (word in fine or word.isdecimal())
+        ] or reader.strange
         words = ", ".join(f"'{word[:40]}'" for word in dict.fromkeys(listed))
         raise InputError(
             f"The request has words that are not understood: {words}. It may name numbers, doors, "

@@ -1,10 +1,14 @@
 """The command line: commands that work on a toy run, and one sentence for what does not."""
 
+import base64
 import errno
+import io
 import json
 import os
+import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -30,7 +34,7 @@ def test_bad_shards_are_sentences_and_leave_no_run(command, toy_shards, tmp_path
 
     empty = tmp_path / "empty"
     (empty / "train").mkdir(parents=True)
-    assert "The 'train' split of " in fit(empty) and "holds no shards" in fit(empty)
+    assert "empty has no index.json; it is not a finished folder of shards" in fit(empty)
 
     corrupt = shutil.copytree(toy_shards, tmp_path / "corrupt")
     victim = list_shards(corrupt, "train")[1]
@@ -68,11 +72,16 @@ def test_synthesize_writes_rooms_and_the_same_again(command, toy_run, tmp_path):
 
 
 def test_synthesize_writes_walls_if_asked(command, toy_run, tmp_path):
-    call = ["synthesize", "--run", toy_run, "-n", 1, "--out"]
+    call = ["synthesize", "--run", toy_run, "-n", 1, "--html", "--out"]
     for shell, nodes in (("walls", {"floor", "wall_0", "ceiling"}), ("none", set())):
         assert command(*call, shell, "--shell", shell)[0] == 0
         found = set(trimesh.load_scene(tmp_path / shell / "seed0_0000.glb").graph.nodes_geometry)
         assert found & {"floor", "wall_0", "ceiling"} == nodes
+        page = (tmp_path / shell / "rooms.html").read_text()
+        (model,) = re.findall('src="data:model/gltf-binary;base64,([^"]+)"', page)
+        model = trimesh.load_scene(io.BytesIO(base64.b64decode(model)), file_type="glb")
+        shown = set(model.graph.nodes_geometry) & {"floor", "wall_0", "ceiling"}
+        assert shown == {"floor"} | nodes  # a page shows the floor in any case
     pictures = [(tmp_path / shell / "overview.png").read_bytes() for shell in ("walls", "none")]
     assert pictures[0] != pictures[1]
     said = one_sentence(command(*call, "other", "--shell", "roof"))
@@ -115,6 +124,7 @@ def refuse(number: int):
         ),
         (errno.EROFS, "(Read-only file system); name a folder that can be written."),
         (errno.EACCES, "(Permission denied); change its permissions, or name another"),
+        (errno.ENOENT, "(No such file or directory); check the path, or name another folder."),
         (errno.EDQUOT, "(Disk quota exceeded); free space in your quota"),
         (errno.EMFILE, "(Too many open files); allow more open files with `ulimit -n 4096`."),
     ],
@@ -144,6 +154,25 @@ def test_what_a_command_could_not_write_is_named(command, toy_run, monkeypatch, 
     said = one_sentence(command(name, *run, *more, "target"))
     assert "target cannot be read or written (No space left on device); free space" in said
     assert not list(Path().iterdir())
+
+
+def test_a_folder_that_is_not_empty_is_noticed_before_torch_is_imported(tmp_path):
+    (tmp_path / "file").touch()
+    words = ["sceneprior", "synthesize", "--run", "demo-bedroom", "--out", str(tmp_path)]
+    code = (
+        f"import sys; sys.argv = {words!r}\nfrom sceneprior.apps import cli\n"
+        "try:\n    cli.main()\nfinally:\n    print('torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout == "False\n" and "is not empty; add --overwrite" in done.stderr
+
+
+@pytest.mark.parametrize("words", [("synthesize", "-n", 1, "--out"), ("make-homes",)])
+def test_a_folder_that_cannot_be_made_is_a_sentence(command, toy_run, words):
+    name, *more = words
+    run = [] if name == "make-homes" else ["--run", toy_run]
+    said = one_sentence(command(name, *run, *more, "/proc/none"))
+    assert "/proc/none" in said and "cannot be read or written (No such file or directory)" in said
 
 
 def test_a_folder_is_no_file_for_results(command, toy_run, tmp_path):

@@ -103,7 +103,7 @@ def test_complete(command, toy_run, rooms, tmp_path, monkeypatch):
     status, out, errors = command(*call, "-n", 2, "--out", "whole")
     assert (status, out) == (
         0,
-        "Wrote 2 rooms around 1 given objects, decoded from fitted latents, to whole\n",
+        "Wrote 2 rooms around 1 given object, decoded from fitted latents, to whole\n",
     ), errors
     made = json.loads((tmp_path / "whole" / "complete_01.json").read_text())
     assert made["objects"][0] == scene["objects"][0] and made["extra"]["given"] == [0]
@@ -143,7 +143,7 @@ def test_complete_adds_what_is_asked_for(command, sampler_run, tmp_path, few_att
     (tmp_path / "full.json").write_text(json.dumps(empty | {"objects": [bed], "floor_m": floor}))
     full = ["complete", "--given", "full.json", "-n", 1, "--classes", "double_bed"]
     status, out, errors = command(*full, "--run", sampler_run, "--out", "full")
-    assert status == 0 and out.startswith("Wrote 1 rooms around 1 given objects")
+    assert status == 0 and out.startswith("Wrote 1 room around 1 given object,")
     assert "Note: complete_00 has no place for double_bed." in errors
     room = json.loads((tmp_path / "full" / "complete_00.json").read_text())
     assert len(room["objects"]) == 1 and room["extra"]["no_place"] == ["double_bed"]

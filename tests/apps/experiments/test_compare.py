@@ -131,7 +131,7 @@ def test_a_part_keeps_the_order_and_names_what_there_is(written):
         ),
         (
             {"methods": {"a": {"title": "A", "set": {"toy": ["model.widht=3"]}}}},
-            "unknown key 'model.widht'; the nearest valid key is 'width'",
+            "unknown key 'model.widht'; the nearest valid key is 'model.width'",
         ),
     ],
 )

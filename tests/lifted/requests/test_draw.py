@@ -6,7 +6,7 @@ import shapely
 
 import sceneprior
 from sceneprior.apps.sample import sample_rooms
-from sceneprior.core.errors import InputError
+from sceneprior.core.errors import InputError, InputWarning
 from sceneprior.core.scene import Scene
 from sceneprior.lifted.requests.placement_rules import backed_by_walls
 from sceneprior.lifted.requests.relation_checks import Furniture
@@ -53,6 +53,20 @@ def test_a_seed_draws_the_same_rooms_the_first_however_many_follow(prior):
         assert labels(a) == labels(b)
         np.testing.assert_allclose(a.centers_m, b.centers_m, atol=1e-4)
     assert not same(more[0], more[1])
+
+
+@pytest.mark.parametrize(
+    ("floor", "said"), [("1x1", "1.0 square metres is smaller"), ("40x40", "is larger")]
+)
+def test_floors_unlike_those_of_training_rooms_are_noted(prior, floor, said):
+    with pytest.warns(InputWarning, match=f"{said} than in nearly all training rooms"):
+        prior.sample(1, floor=floor)
+
+
+def test_usual_floors_and_drawn_ones_are_not_noted(prior, recwarn):
+    prior.sample(1, floor="4x3")
+    prior.sample(1, want={"double_bed": 1})
+    assert not [each for each in recwarn if issubclass(each.category, InputWarning)]
 
 
 @pytest.mark.parametrize("floor", ["4x3", L_SHAPE, [[0, 0], [4, 0], [5, 3], [2, 4], [0, 3]]])
