@@ -260,11 +260,11 @@ def _faults(every: RayFit, guess: Guess) -> int:
 
 
 def _bars(guess: Guess, hangs: bool) -> Iterator[tuple[int, Int[np.ndarray, "3 2"]]]:
-    """Boxes that connect each part to each other part, and to the floor or, for an object that
-    hangs, the ceiling: as wide as the overlap of the two, and two levels wide. Each comes with its
-    mirroring."""
-    support = np.array([[0, LEVELS]] * 3)
-    support[1] = LEVELS if hangs else 0
+    """Boxes that connect each part to each other part and, for an object that hangs, to the
+    ceiling: as wide as the overlap of the two, and two levels wide. Each comes with its mirroring.
+    None stands on the floor: an object on a thin post would tip over."""
+    ceiling = np.array([[0, LEVELS]] * 3)
+    ceiling[1] = LEVELS
     both = ACROSS_X | ACROSS_Z
     ends = list(zip(guess.mirrored.tolist(), guess.ends, strict=True))
     for across, own in ends.copy():
@@ -273,7 +273,7 @@ def _bars(guess: Guess, hangs: bool) -> Iterator[tuple[int, Int[np.ndarray, "3 2
             if across & bit:
                 whole[axis] = _with_image(own[axis])
         ends += [(0, whole)] if across else []
-    targets = [*ends, (both, support)]
+    targets = [*ends, (both, ceiling)] if hangs else ends
     for (one, here), (other, there) in itertools.product(ends, targets):
         last_low = np.maximum(here[:, 0], there[:, 0])
         first_high = np.minimum(here[:, 1], there[:, 1])

@@ -159,10 +159,10 @@ def teach(sampler: RoomSampler, rooms: SamplerRooms) -> None:
     labels = rooms.rooms.object_class[here]
     sampler.footprints_m2.scatter_reduce_(0, labels, areas_m2, "mean", include_self=False)
     found = find_sizes(rooms.rooms, prototypes, len(sampler.backs))
-    for buffer, values in zip(
+    for buffer, entries in zip(
         (sampler.sizes_m, sampler.bottoms_m, sampler.size_counts), found, strict=True
     ):
-        buffer.copy_(values)
+        buffer.copy_(entries)
     sampler.backs.copy_(find_backs(rooms.rooms, len(sampler.backs)))
     fronts, confidence = find_fronts(rooms.rooms, prototypes, len(sampler.fronts))
     sampler.fronts.copy_(fronts)
