@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from capture_files import timestamp, write_grounded_sam2_images, write_polycam
+from capture_files import write_grounded_sam2_images, write_polycam
 from model_folder import blocks, write_models
 from pages import PAGES, ROOT, Block, blocks_of, commands_of, name_of
 from PIL import Image
@@ -114,8 +114,8 @@ def write_phone(path: Path, toys: Toys) -> None:
     """Polycam's poses, and the masks of a segmenter of single images."""
     for k in range(12):
         room = PosedRoom(path / f"room{k}", furniture(0.1 * k - 0.5)).write()
-        write_grounded_sam2_images(room, timestamp)
         write_polycam(room)
+        write_grounded_sam2_images(room)
     Path("classes.txt").write_text("bed\nchair\n")
 
 
