@@ -4,7 +4,6 @@ Each step tries all changes on a subset of the rays, and the best of them on all
 change is kept; the search ends when no change lowers the loss (`part_loss.py`).
 """
 
-import itertools
 from collections.abc import Iterator
 
 import numpy as np
@@ -25,6 +24,7 @@ from sceneprior.core.parts import (
 from sceneprior.lifted.lifting.lifted import RayPool
 from sceneprior.lifted.lifting.outlines import outline_of
 from sceneprior.lifted.lifting.part_loss import Change, Guess, RayFit
+from sceneprior.lifted.lifting.part_mends import closed, faults_of, lowered, supports, whole
 from sceneprior.lifted.lifting.part_prices import LEVELS
 
 CURVED = (CYLINDER, ELLIPSOID, DOME, BOWL)
@@ -34,8 +34,6 @@ PLACES = (0.25, 0.5, 0.75)
 """Positions at which parts are split, as shares of their length."""
 SHORTEST = 4
 """Length in levels below which a part is not split."""
-SLIT, SLIT_LOSS = 8, 0.002
-"""Width in levels up to which a slit is closed, and the increase of the loss up to which it is."""
 PIECES = 4
 """Number of uncovered pieces of the hull, the largest first, in which new parts are tried."""
 SCREENED, FINALISTS = 768, 6
@@ -66,7 +64,7 @@ def fit_parts(
     some = RayFit(RayPool(*(part[:SCREENED] for part in rays)), margin, outline, hangs)
     while better := _one_more(every, some, guess, hull) or _one_more(every, every, guess, hull):
         guess = better
-    return _needed(every, _whole(every, _closed(every, guess))).parts(outline)
+    return _needed(every, whole(every, closed(every, guess))).parts(outline)
 
 
 def _one_more(
@@ -97,10 +95,9 @@ def _one_more(
 def _changes(
     guess: Guess, hull: Bool[np.ndarray, "x y z"], curved: bool, hangs: bool
 ) -> Iterator[Change]:
-    """Changes to try: a different kind for a part; a part
-    mirrored with its own or a quarter of its width; a part split in two, each fitted to the hull; a
-    part extended to the floor; supports of a part; a new part around an uncovered piece of
-    the hull."""
+    """Changes to try: a different kind for a part; a part mirrored with its own or a quarter of its
+    width; a part split in two, each fitted to the hull; a part extended to the floor; supports of a
+    part; a new part around an uncovered piece of the hull."""
     new = len(guess.kinds)
     room = new < MOST_PARTS
     for row in range(new):
@@ -125,9 +122,9 @@ def _changes(
                 if single and share < 0.5:
                     yield {row: (BOX, across | bit, one), new: (BOX, across, other)}
         if ends[1, 0] > 0:
-            yield _lowered(guess, row)
+            yield lowered(guess, row)
         if room and (LEVELS - ends[1, 1] if hangs else ends[1, 0]) >= SHORTEST:
-            yield from ({new: (BOX, *each)} for each in _supports(ends, hangs))
+            yield from ({new: (BOX, *each)} for each in supports(ends, hangs))
     labels, pieces = ndimage.label(hull & ~_cells_in(guess, len(hull)))
     if not pieces or not room:
         return
@@ -136,33 +133,6 @@ def _changes(
         own = np.array([[side.start, side.stop] for side in boxes[piece]]) * LEVELS // len(hull)
         for across in (0, ACROSS_X, ACROSS_Z, ACROSS_X | ACROSS_Z):
             yield {new: (BOX, across, own)}
-
-
-def _supports(
-    ends: Int[np.ndarray, "3 2"], hangs: bool
-) -> Iterator[tuple[int, Int[np.ndarray, "3 2"]]]:
-    """Supports of a part, each as mirroring and ends: four legs, two side panels, or a front and a
-    back panel on the floor; for an object that hangs, a cord from the middle to the ceiling."""
-    if hangs:
-        cord = ends.copy()
-        middle = ends.sum(axis=1) // 2
-        cord[::2] = np.stack([middle - 1, middle + 1], axis=1)[::2]
-        cord[1] = ends[1, 1], LEVELS
-        yield 0, cord
-        return
-    under = ends.copy()
-    under[1] = 0, ends[1, 0]
-    for axes, across in (((0, 2), ACROSS_X | ACROSS_Z), ((0,), ACROSS_X), ((2,), ACROSS_Z)):
-        leg = under.copy()
-        for axis in axes:
-            leg[axis, 1] = min(leg[axis, 0] + SHORTEST, ends[axis, 1])
-        yield across, leg
-
-
-def _with_image(ends: Int[np.ndarray, "2"]) -> tuple[int, int]:
-    """Ends along one axis of the interval around a part and its mirror image."""
-    far = int(max(ends[1], LEVELS - ends[0]))
-    return LEVELS - far, far
 
 
 def _extents_of(
@@ -196,93 +166,10 @@ def _needed(every: RayFit, guess: Guess) -> Guess:
     row = 0
     while row < len(guess.kinds) > 1:
         trial = every.without(guess, row)
-        if _faults(every, trial) <= _faults(every, guess) and every.loss(trial) < every.loss(guess):
+        if faults_of(every, trial) <= faults_of(every, guess) and every.loss(trial) < every.loss(
+            guess
+        ):
             guess, row = trial, 0
         else:
             row += 1
     return guess
-
-
-def _closed(every: RayFit, guess: Guess) -> Guess:
-    """The guess without narrow slits between a part and its mirror image, unless rays show them."""
-    for row in range(len(guess.kinds)):
-        for axis, bit in ((0, ACROSS_X), (2, ACROSS_Z)):
-            low, high = guess.ends[row, axis]
-            slit = max(LEVELS - 2 * high, 2 * low - LEVELS)
-            if guess.mirrored[row] & bit and 0 < slit <= SLIT:
-                joined = guess.ends[row].copy()
-                joined[axis] = _with_image(joined[axis])
-                across = int(guess.mirrored[row]) & ~bit
-                trial = every.changed(guess, {row: (int(guess.kinds[row]), across, joined)})
-                if every.loss(trial) < every.loss(guess) + SLIT_LOSS:
-                    guess = trial
-    return guess
-
-
-def _whole(every: RayFit, guess: Guess) -> Guess:
-    """The guess as one piece that reaches the floor or, if it hangs, the ceiling, whatever that
-    costs. Masks often miss thin cords and legs, but nothing floats. Each step adds a bar or
-    supports, or removes a part; the cheapest step that mends something is taken."""
-    while faults := _faults(every, guess):
-        new = len(guess.kinds)
-        trials = [every.without(guess, row) for row in range(new) if new > 1]
-        changes = _mends(guess, every.hangs) if new < MOST_PARTS else ()
-        trials += [every.changed(guess, change) for change in changes]
-        mended = [each for each in trials if _faults(every, each) < faults]
-        if not mended:
-            break
-        guess = min(mended, key=every.loss)
-    return guess
-
-
-def _mends(guess: Guess, hangs: bool) -> Iterator[Change]:
-    """Bars and supports, and for an object that stands also parts extended to the floor."""
-    new = len(guess.kinds)
-    yield from ({new: (BOX, *bar)} for bar in _bars(guess, hangs))
-    for row, ends in enumerate(guess.ends):
-        if ends[1, 1] < LEVELS if hangs else ends[1, 0] > 0:
-            yield from ({new: (BOX, *each)} for each in _supports(ends, hangs))
-            if not hangs:
-                yield _lowered(guess, row)
-
-
-def _lowered(guess: Guess, row: int) -> Change:
-    """The change that extends a part to the floor."""
-    down = guess.ends[row].copy()
-    down[1, 0] = 0
-    return {row: (int(guess.kinds[row]), int(guess.mirrored[row]), down)}
-
-
-def _faults(every: RayFit, guess: Guess) -> int:
-    """Number of pieces beyond one, and one more for a gap to the floor or the ceiling."""
-    gap, pieces = every.gap_and_pieces(guess)
-    return pieces - 1 + (gap > 0)
-
-
-def _bars(guess: Guess, hangs: bool) -> Iterator[tuple[int, Int[np.ndarray, "3 2"]]]:
-    """Boxes that connect each part to each other part and, for an object that hangs, to the
-    ceiling: as wide as the overlap of the two, and two levels wide. Each comes with its mirroring.
-    None stands on the floor: an object on a thin post would tip over."""
-    ceiling = np.array([[0, LEVELS]] * 3)
-    ceiling[1] = LEVELS
-    both = ACROSS_X | ACROSS_Z
-    ends = list(zip(guess.mirrored.tolist(), guess.ends, strict=True))
-    for across, own in ends.copy():
-        whole = own.copy()  # with the mirror images
-        for bit, axis in ((ACROSS_X, 0), (ACROSS_Z, 2)):
-            if across & bit:
-                whole[axis] = _with_image(own[axis])
-        ends += [(0, whole)] if across else []
-    targets = [*ends, (both, ceiling)] if hangs else ends
-    for (one, here), (other, there) in itertools.product(ends, targets):
-        last_low = np.maximum(here[:, 0], there[:, 0])
-        first_high = np.minimum(here[:, 1], there[:, 1])
-        between = np.sort([last_low, first_high], axis=0)  # the gap, or the overlap
-        narrow = between.copy()
-        overlaps = last_low <= first_high
-        middle = between.sum(axis=0)[overlaps] // 2
-        narrow[:, overlaps] = middle - 1, middle + 1
-        for low, high in (between, narrow):
-            bar = np.stack([low, np.maximum(high, low + 1)], axis=1).clip(0, LEVELS)
-            if (bar[:, 0] < bar[:, 1]).all():
-                yield one & other, bar

@@ -17,8 +17,10 @@ from sceneprior.core.parts import (
 )
 from sceneprior.lifted.lifting.lifted import RayPool
 from sceneprior.lifted.lifting.outlines import area_table
-from sceneprior.lifted.lifting.part_fit import _closed, _supports, fit_parts
+from sceneprior.lifted.lifting.part_fit import fit_parts
 from sceneprior.lifted.lifting.part_loss import RayFit
+from sceneprior.lifted.lifting.part_mends import closed as without_slits
+from sceneprior.lifted.lifting.part_mends import supports
 from sceneprior.lifted.lifting.part_prices import gap_and_pieces, overhang
 
 MARGIN, CELLS = 1.1, 32
@@ -94,7 +96,7 @@ def test_a_narrow_slit_between_a_part_and_its_image_is_closed_unless_rays_pass_i
         if not count:
             rays = rays._replace(hits=np.ones(40, bool))
         fit = RayFit(rays, MARGIN)
-        found = _closed(fit, fit.guess(halves.kind, halves.mirrored, ends))
+        found = without_slits(fit, fit.guess(halves.kind, halves.mirrored, ends))
         assert (found.mirrored[0] == 0) == closed
         assert found.ends[0, 0].tolist() == ([0, 64] if closed else [0, 30])
 
@@ -174,6 +176,6 @@ def test_a_round_bench_keeps_its_outline():
 def test_what_stands_below_a_part_is_no_wider(first):
     """Compiled code checks no index: an end beyond the last level would be read from elsewhere."""
     ends = np.array([[first, first + 2], [20, 40], [first, first + 2]])
-    for _, below in _supports(ends, hangs=False):
+    for _, below in supports(ends, hangs=False):
         assert (below[[0, 2], 0] >= first).all() and (below[[0, 2], 1] <= first + 2).all()
         assert (below[:, 0] < below[:, 1]).all() and below[1].tolist() == [0, 20]
