@@ -2,6 +2,7 @@
 editable install works beside the clone, too."""
 
 import os
+import site
 import subprocess
 import sys
 from pathlib import Path
@@ -38,14 +39,16 @@ def test_an_editable_install_works_in_the_folder_that_holds_the_clone(tmp_path):
         check=True,
     )  # fmt: skip
     (path_file,) = prefix.rglob("*.pth")
+    # -S: this environment has an editable install of its own, whose place on the path comes later.
+    folders = [str(path_file.parent), *site.getsitepackages()]
     code = (
-        f"import site; site.addsitedir({str(path_file.parent)!r}); import sceneprior\n"
+        f"import site; [site.addsitedir(folder) for folder in {folders!r}]; import sceneprior\n"
         "from sceneprior.apps.config import load_config\n"
         "assert load_config('bedroom.yaml').model.max_objects == 13\n"
         "print(sceneprior.load.__module__, sceneprior.__file__)"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True,
+        [sys.executable, "-S", "-c", code], cwd=tmp_path, capture_output=True, text=True,
         env={key: value for key, value in os.environ.items() if key != "PYTHONPATH"},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
