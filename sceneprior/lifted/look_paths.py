@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sceneprior.core.geometry.part_meshes import stretched
+from sceneprior.core.geometry.part_meshes import Stretch
 from sceneprior.core.geometry.turns import quarter_rotation
 from sceneprior.core.parts import SQUARE, Parts
 from sceneprior.lifted.prototypes import turn_of
@@ -83,14 +83,11 @@ def posed_parts(parts: Parts, pose: int) -> Parts:
     )
 
 
-def stretched_parts(
-    parts: Parts, own: Parts, size_m: Float[np.ndarray, "3"], new_size_m: Float[np.ndarray, "3"]
-) -> Parts:
-    """Stretch parts as an object that consists of `own` is stretched from the extents `size_m` to
-    `new_size_m` (`stretched`). Parts are in the frame of the object's box."""
+def stretched_parts(parts: Parts, own: Stretch, new_size_m: Float[np.ndarray, "3"]) -> Parts:
+    """Stretch parts, in the frame of the object's box, to a box of the extents `new_size_m`."""
     corners = parts.ends.transpose(0, 2, 1).reshape(-1, 3)
     points = np.concatenate([corners, np.insert(parts.outline, 1, 0.0, axis=1)])
-    corners, outline = np.split(stretched(points, own, size_m, new_size_m), [len(corners)])
+    corners, outline = np.split(own.moved(points, new_size_m), [len(corners)])
     return parts._replace(
         ends=corners.reshape(-1, 2, 3).transpose(0, 2, 1),
         outline=parts.outline if np.array_equal(parts.outline, SQUARE) else outline[:, ::2],

@@ -13,7 +13,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from sceneprior.core.geometry.part_blends import blend_parts, matched_parts
-from sceneprior.core.geometry.part_meshes import stretched, surface_of_parts
+from sceneprior.core.geometry.part_meshes import Stretch, surface_of_parts
 from sceneprior.core.parts import (
     KIND_NAMES,
     MOST_CORNERS,
@@ -59,8 +59,8 @@ class Posed(NamedTuple):
 
     parts: Parts
     surface: Mesh
-    size_m: Float[np.ndarray, "3"]
-    """Extents of the prototype, in this pose."""
+    stretch: Stretch
+    """Stretches the prototype, in this pose, to other extents."""
 
 
 class LookDecoder(ShapeModule):
@@ -227,7 +227,7 @@ class LookDecoder(ShapeModule):
         if pair not in self._matched:
             self._matched[pair] = matched_parts(*(each.parts for each in own))
         here, there = (
-            stretched_parts(parts, each.parts, each.size_m, size_m)
+            stretched_parts(parts, each.stretch, size_m)
             for parts, each in zip(self._matched[pair], own, strict=True)
         )
         return blend_parts(here, there, share)
@@ -251,13 +251,13 @@ class LookDecoder(ShapeModule):
     def mesh(self, look: int, box_m: Float[np.ndarray, "6"]) -> Mesh:
         """The mesh of a look, stretched into a box (centre, full extents)."""
         own = self._posed(look)
-        vertices = stretched(own.surface.vertices_m, own.parts, own.size_m, box_m[3:])
+        vertices = own.stretch.moved(own.surface.vertices_m, box_m[3:])
         return Mesh(vertices * box_m[3:] + box_m[:3], own.surface.faces)
 
     def solids(self, look: int, box_m: Float[np.ndarray, "6"]) -> tuple[Solid, ...]:
         """The solids of a look in a box (centre, full extents), as `mesh` places its surface."""
         own = self._posed(look)
-        return _solids_in(stretched_parts(own.parts, own.parts, own.size_m, box_m[3:]), box_m)
+        return _solids_in(stretched_parts(own.parts, own.stretch, box_m[3:]), box_m)
 
     def _posed(self, look: int) -> Posed:
         """The shape of a look; computed once."""
@@ -270,7 +270,8 @@ class LookDecoder(ShapeModule):
             # Mirroring inverts the faces: reverse their corners.
             faces = surface.faces[:, ::-1].copy() if mirrored else surface.faces
             own_m = turned_extents(size_m[None], pose)[0]
-            self._shapes[look] = Posed(posed_parts(parts, pose), Mesh(vertices, faces), own_m)
+            posed = posed_parts(parts, pose)
+            self._shapes[look] = Posed(posed, Mesh(vertices, faces), Stretch.of(posed, own_m))
         return self._shapes[look]
 
     @property

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from parts_of_rooms import CORNER, TABLE, boxes
 
-from sceneprior.core.geometry.part_meshes import THIN_M, stretched, surface_of_parts
+from sceneprior.core.geometry.part_meshes import THIN_M, Stretch, surface_of_parts
 from sceneprior.core.parts import (
     ACROSS_X,
     BOWL,
@@ -78,7 +78,7 @@ def test_legs_keep_their_thickness_and_tables_fill_their_new_box():
     legs = boxes((0, 64, 62, 64, 0, 64), (0, 4, 0, 62, 0, 8), mirrored=(0, 3))
     assert 4 / 64 * size_m[0] < THIN_M and 8 / 64 * size_m[2] < THIN_M
     points = np.array([[-0.5, -0.5, -0.5], [4 / 64 - 0.5, 62 / 64 - 0.5, 8 / 64 - 0.5], [0.5] * 3])
-    low, inner, high = stretched(points, legs, size_m, wide_m) * wide_m
+    low, inner, high = Stretch.of(legs, size_m).moved(points, wide_m) * wide_m
     np.testing.assert_allclose(high - low, wide_m)
     thickness = (inner - low)[[0, 2]]
     np.testing.assert_allclose(thickness, [4 / 64 * 0.8, 8 / 64 * 0.4])
@@ -88,14 +88,14 @@ def test_legs_keep_their_thickness_and_tables_fill_their_new_box():
 def test_what_is_thin_throughout_is_stretched_as_a_whole():
     board = boxes((0, 64, 0, 64, 0, 64))
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (9, 3))
-    found = stretched(points, board, np.array([0.05, 1, 1]), np.array([0.5, 2, 3]))
+    found = Stretch.of(board, np.array([0.05, 1, 1])).moved(points, np.array([0.5, 2, 3]))
     np.testing.assert_allclose(found, points)
 
 
 def test_stretching_keeps_the_order_of_points_and_meshes_closed():
     vertices, faces = surface_of_parts(TABLE)
     for new_m in ([2.0, 0.7, 0.5], [0.3, 0.2, 0.4]):
-        moved = stretched(vertices, TABLE, np.array([1.0, 0.75, 0.6]), np.array(new_m))
+        moved = Stretch.of(TABLE, np.array([1.0, 0.75, 0.6])).moved(vertices, np.array(new_m))
         for axis in range(3):
             order = np.argsort(vertices[:, axis], kind="stable")
             assert (np.diff(moved[order, axis]) >= -1e-12).all()

@@ -6,7 +6,7 @@ import torch
 import trimesh
 from parts_of_rooms import CORNER, TABLE
 
-from sceneprior.core.geometry.part_meshes import surface_of_parts
+from sceneprior.core.geometry.part_meshes import Stretch, surface_of_parts
 from sceneprior.core.parts import filled_cells
 from sceneprior.core.views import DecodedScenes
 from sceneprior.lifted.look_paths import posed_parts, shown_looks, stretched_parts
@@ -55,7 +55,7 @@ def test_parts_pose_and_stretch_as_the_mesh_of_their_look_does(decoder):
     for look in range(2 * POSES):
         own = posed_parts(decoder.parts(look // POSES), look % POSES)
         size_m = turned_extents(decoder.sizes_m[look // POSES][None].double().numpy(), look % POSES)
-        parts = stretched_parts(own, own, size_m[0], box_m[3:])
+        parts = stretched_parts(own, Stretch.of(own, size_m[0]), box_m[3:])
         vertices, faces = surface_of_parts(parts)
         here, there = trimesh.Trimesh(vertices * box_m[3:], faces), decoder.mesh(look, box_m)
         mesh = trimesh.Trimesh(there.vertices_m, there.faces)

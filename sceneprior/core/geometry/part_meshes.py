@@ -1,9 +1,9 @@
 """Closed triangle meshes of furniture in parts."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from sceneprior.core.geometry.corners import CUBE_CORNERS
 from sceneprior.core.parts import BOWL, BOX, CYLINDER, DOME, SQUARE, Parts, center_and_radii
@@ -93,30 +93,44 @@ def solid_points(kind: int, ends: Float[np.ndarray, "3 2"]) -> Float[np.ndarray,
     return corners
 
 
-def stretched(
-    points: Float[np.ndarray, "points 3"],
-    parts: Parts,
-    size_m: Float[np.ndarray, "3"],
-    new_size_m: Float[np.ndarray, "3"],
-) -> Float[np.ndarray, "points 3"]:
-    """Stretch points of an object, in the frame of its box, to a box of other extents. Thin parts
-    keep their thickness in metres, and the rest is stretched. The result is in the frame of the
-    new box."""
-    moved = np.empty_like(points)
-    solids = np.stack([ends for _, ends in parts.solids()])
-    for axis in range(3):
-        ends = solids[:, axis]
-        knots = np.unique(np.concatenate([[-0.5, 0.5], ends.ravel()]))
-        middles = (knots[1:] + knots[:-1]) / 2
-        thin = ends[ends[:, 1] - ends[:, 0] <= THIN_M / size_m[axis]]
-        kept = ((middles[:, None] > thin[:, 0]) & (middles[:, None] < thin[:, 1])).any(axis=1)
-        lengths = np.diff(knots)
-        kept_length = (lengths * kept).sum() * size_m[axis] / new_size_m[axis]
-        if kept.all() or kept_length > MOST_THIN:
-            moved[:, axis] = points[:, axis]
-            continue
-        rest = (1 - kept_length) / (lengths * ~kept).sum()
-        scale = np.where(kept, size_m[axis] / new_size_m[axis], rest)
-        places = np.concatenate([[0], np.cumsum(lengths * scale)]) - 0.5
-        moved[:, axis] = np.interp(points[:, axis], knots, places)
-    return moved
+class Stretch(NamedTuple):
+    """A way to stretch an object to other extents: thin parts keep their thickness in metres, and
+    the rest is stretched."""
+
+    size_m: Float[np.ndarray, "3"]
+    """The object's own extents."""
+    knots: tuple[Float[np.ndarray, " knots"], ...]
+    """Ends of the parts along each axis, in ascending order, in the frame of the object's box."""
+    kept: tuple[Bool[np.ndarray, " intervals"], ...]
+    """True for intervals between knots that keep their length in metres."""
+
+    @classmethod
+    def of(cls, parts: Parts, size_m: Float[np.ndarray, "3"]) -> "Stretch":
+        """The stretch of an object that consists of `parts`."""
+        solids = np.stack([ends for _, ends in parts.solids()])
+        knots, kept = [], []
+        for axis in range(3):
+            ends = solids[:, axis]
+            knots.append(np.unique(np.concatenate([[-0.5, 0.5], ends.ravel()])))
+            middles = (knots[-1][1:] + knots[-1][:-1]) / 2
+            thin = ends[ends[:, 1] - ends[:, 0] <= THIN_M / size_m[axis]]
+            inside = (middles[:, None] > thin[:, 0]) & (middles[:, None] < thin[:, 1])
+            kept.append(inside.any(axis=1))
+        return cls(size_m, tuple(knots), tuple(kept))
+
+    def moved(
+        self, points: Float[np.ndarray, "points 3"], new_size_m: Float[np.ndarray, "3"]
+    ) -> Float[np.ndarray, "points 3"]:
+        """Move points of the object, in the frame of its box, to where they are in a box of the
+        extents `new_size_m`, in the frame of that box."""
+        moved = points.copy()
+        for axis, (knots, kept) in enumerate(zip(self.knots, self.kept, strict=True)):
+            lengths = np.diff(knots)
+            kept_length = (lengths * kept).sum() * self.size_m[axis] / new_size_m[axis]
+            if kept.all() or kept_length > MOST_THIN:
+                continue
+            rest = (1 - kept_length) / (lengths * ~kept).sum()
+            scale = np.where(kept, self.size_m[axis] / new_size_m[axis], rest)
+            places = np.concatenate([[0], np.cumsum(lengths * scale)]) - 0.5
+            moved[:, axis] = np.interp(points[:, axis], knots, places)
+        return moved
