@@ -23,7 +23,7 @@ FLAGS = (
 )
 
 
-def wait_for(condition: Callable[[], object], said: str, seconds: float = 120) -> None:
+def wait_for(condition: Callable[[], object], said: str, seconds: float = 600) -> None:
     """WebGL in software takes long, on a machine that does other things as well."""
     limit = time.monotonic() + seconds
     while not condition():
