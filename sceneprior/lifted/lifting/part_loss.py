@@ -6,7 +6,8 @@
       + 0.06 (gap between the largest connected piece and the floor, or the ceiling for lamps;
               1 for the box's height)
       + 0.005 (connected pieces - 1)
-      + 0.1 (overhang of the centre beyond the feet, unless the object hangs; 1 for the box's width)
+      + 0.1 (overhang of the centre of volume, or of the middle of the box, beyond the feet, unless
+             the object hangs; 1 for the box's width)
 
 A ray is a hit if its pixel belongs to the object, else a miss; it is explained if it meets a part
 exactly when it is a hit. Rays are cut to the object's outline, as the parts are. Vertical rays
@@ -102,7 +103,6 @@ class RayFit:
         missed, wrongly_met = wrong_rays(guess.met_by, self.hits)
         volume = sum(map(volume_of, guess.kinds, guess.mirrored, guess.ends))
         gap, pieces = self.gap_and_pieces(guess)
-        tipping = 0 if self.hangs else overhang(guess.mirrored, guess.ends, self.area)
         return float(
             self.hit_price * missed
             + self.miss_price * wrongly_met
@@ -112,13 +112,17 @@ class RayFit:
             + VOLUME_PRICE * volume
             + GAP_PRICE * gap / LEVELS
             + PIECE_PRICE * (pieces - 1)
-            + OVERHANG_PRICE * tipping / LEVELS
+            + OVERHANG_PRICE * self.overhang(guess) / LEVELS
         )
 
     def gap_and_pieces(self, guess: Guess) -> tuple[int, int]:
         """Gap in levels to the floor or the ceiling, and number of connected pieces."""
         gap, pieces = gap_and_pieces(guess.mirrored, guess.ends, self.area, self.hangs)
         return int(gap), int(pieces)
+
+    def overhang(self, guess: Guess) -> float:
+        """Overhang in levels beyond the lowest parts; 0 for an object that hangs."""
+        return 0.0 if self.hangs else float(overhang(guess.mirrored, guess.ends, self.area))
 
     def guess(
         self,

@@ -1,4 +1,4 @@
-"""Mends the parts of a prototype: no slits, one piece, and nothing that floats."""
+"""Mends the parts of a prototype: no slits, one piece, and nothing that floats or tips over."""
 
 import itertools
 from collections.abc import Iterator
@@ -33,9 +33,10 @@ def closed(every: RayFit, guess: Guess) -> Guess:
 
 
 def whole(every: RayFit, guess: Guess) -> Guess:
-    """The guess as one piece that reaches the floor or, if it hangs, the ceiling, whatever that
-    costs. Masks often miss thin cords and legs, but nothing floats. Each step adds a bar or
-    supports, or removes a part; the cheapest step that mends something is taken."""
+    """The guess as one piece that stands on the floor without tipping over or, if it hangs, reaches
+    the ceiling, whatever that costs. Masks often miss thin cords and legs, but nothing floats. Each
+    step adds a bar or supports, or mirrors or removes a part; the cheapest step that mends
+    something is taken."""
     while faults := faults_of(every, guess):
         new = len(guess.kinds)
         trials = [every.without(guess, row) for row in range(new) if new > 1]
@@ -49,13 +50,15 @@ def whole(every: RayFit, guess: Guess) -> Guess:
 
 
 def faults_of(every: RayFit, guess: Guess) -> int:
-    """Number of pieces beyond one, and one more for a gap to the floor or the ceiling."""
+    """Number of pieces beyond one, one more for a gap to the floor or the ceiling, and one more for
+    an overhang."""
     gap, pieces = every.gap_and_pieces(guess)
-    return abs(pieces - 1) + (gap > 0)
+    return abs(pieces - 1) + (gap > 0) + (every.overhang(guess) > 0)
 
 
 def _mends(guess: Guess, hangs: bool) -> Iterator[Change]:
-    """Bars and supports, and for an object that stands also parts extended to the floor."""
+    """Bars and supports, and for an object that stands also parts extended to the floor, and
+    mirrored feet."""
     new = len(guess.kinds)
     yield from ({new: (BOX, *bar)} for bar in _bars(guess, hangs))
     for row, ends in enumerate(guess.ends):
@@ -63,6 +66,9 @@ def _mends(guess: Guess, hangs: bool) -> Iterator[Change]:
             yield from ({new: (BOX, *each)} for each in supports(ends, hangs))
             if not hangs:
                 yield lowered(guess, row)
+        elif not hangs:
+            kind, across = int(guess.kinds[row]), int(guess.mirrored[row])
+            yield from ({row: (kind, across | bit, ends)} for bit in (ACROSS_X, ACROSS_Z))
 
 
 def _bars(guess: Guess, hangs: bool) -> Iterator[tuple[int, Int[np.ndarray, "3 2"]]]:

@@ -88,8 +88,10 @@ def solids_of(mirrored, ends, area):
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def overhang(mirrored, ends, area):
-    """Distance in levels, along x plus along z, of the parts' centre of volume from the rectangle
-    around the lowest parts. An object with a positive overhang tips over."""
+    """Distance in levels, along x plus along z, from the rectangle around the lowest parts to the
+    parts' centre of volume or to the middle of the box, whichever is further away. With the centre
+    outside, an object tips over; with the middle outside, it stands on one side alone, as no
+    furniture does."""
     solids = solids_of(mirrored, ends, area)
     if not len(solids):
         return 0.0
@@ -108,8 +110,10 @@ def overhang(mirrored, ends, area):
                 high[axis] = max(high[axis], solid[axis, 1])
     beyond = 0.0
     for axis in (0, 2):
-        middle = center[axis] / volume
-        beyond += max(low[axis] - middle, middle - high[axis], 0.0)
+        apart = 0.0
+        for middle in (center[axis] / volume, LEVELS / 2):
+            apart = max(apart, low[axis] - middle, middle - high[axis])
+        beyond += apart
     return beyond
 
 
