@@ -132,14 +132,23 @@ def test_a_table_on_one_leg_would_tip_over():
     leg = [[0, 8], [0, 56], [0, 8]]
     ends = np.array([top, leg])
     assert overhang(np.array([0, ACROSS_X | ACROSS_Z]), ends, EVERYWHERE) == 0
-    volumes = np.array([8 * 64 * 64, 8 * 8 * 56])
-    middle = (volumes * [32, 4]).sum() / volumes.sum()
-    assert overhang(np.array([0, 0]), ends, EVERYWHERE) == pytest.approx(2 * (middle - 8))
-    assert overhang(np.array([0, ACROSS_Z]), ends, EVERYWHERE) == pytest.approx(
-        (np.array([volumes[0], 2 * volumes[1]]) * [32, 4]).sum() / (volumes[0] + 2 * volumes[1]) - 8
-    )
+    assert overhang(np.array([0, 0]), ends, EVERYWHERE) == 2 * (32 - 8)
+    assert overhang(np.array([0, ACROSS_Z]), ends, EVERYWHERE) == 32 - 8
     ends[1, [0, 2]] = 28, 36  # a pedestal
     assert overhang(np.array([0, 0]), ends, EVERYWHERE) == 0
+
+
+def test_the_centre_and_the_middle_are_above_the_feet():
+    """A block is heavier than what it carries: the centre is above it, the middle is not."""
+    ends = np.array([[[0, 20], [0, 60], [0, 64]], [[0, 64], [60, 64], [0, 64]]])
+    volumes = np.array([20 * 60 * 64, 64 * 4 * 64])
+    assert (volumes * [10, 32]).sum() / volumes.sum() < 20
+    assert overhang(np.array([0, 0]), ends, EVERYWHERE) == 32 - 20
+    # The middle is above the feet, and the centre is not.
+    ends = np.array([[[0, 40], [0, 4], [0, 64]], [[32, 64], [4, 64], [0, 64]]])
+    volumes = np.array([40 * 4 * 64, 32 * 60 * 64])
+    center = (volumes * [20, 48]).sum() / volumes.sum()
+    assert overhang(np.array([0, 0]), ends, EVERYWHERE) == pytest.approx(center - 40)
 
 
 def test_wrong_rays_of_several_objects_are_counted_at_once():
