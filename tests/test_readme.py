@@ -29,7 +29,7 @@ def test_steps_run_as_printed(tmp_path):
         assert program == "sceneprior"
         done = subprocess.run(
             [sys.executable, "-m", "sceneprior", *arguments],
-            cwd=tmp_path, capture_output=True, text=True, timeout=600,
+            cwd=tmp_path, capture_output=True, text=True, timeout=1800,
         )  # fmt: skip
         assert done.returncode == 0, f"{command}\n{done.stderr[-2000:]}"
     made = tmp_path / "out/small"
