@@ -5,7 +5,8 @@ of the log-odds that both show the same object (`affinity.py`), measured at the 
 views see. Clustering alternates with space carving (Kutulakos and Seitz, "A theory of shape by
 space carving", IJCV 2000), which compares clusters instead of colours: a cell in which views see
 different clusters, or background, is emptied. At the end, masks that share few cells with others
-join the cluster whose visual hull explains them (`leftovers.py`).
+join the cluster whose visual hull explains them (`leftovers.py`), and masks that are still alone
+are joined by their directions and sizes (`discs.py`).
 """
 
 from typing import NamedTuple
@@ -15,6 +16,7 @@ from jaxtyping import Float, Int
 
 from data_prep.tracks.affinity import id_odds, pair_weights
 from data_prep.tracks.clusters import cluster, main_classes
+from data_prep.tracks.discs import discs_of, join_singles
 from data_prep.tracks.explained import explained
 from data_prep.tracks.leftovers import join_leftovers
 from data_prep.tracks.merged import SPECK, Split, split_merged
@@ -131,6 +133,8 @@ def _labels(
         if np.array_equal(joined, labels):
             break
         labels = joined
+    if odds is None:
+        labels = join_singles(labels, discs_of(ids, view, cameras), view, classes)
     return masks, labels
 
 
