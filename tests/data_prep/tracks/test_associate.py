@@ -52,3 +52,13 @@ def test_no_masks_are_no_objects(room):
     none = FrameMasks(np.full_like(masks.ids, -1), np.zeros(0, dtype=np.int64))
     found = associate(none, poses, lenses)
     assert (found.ids == -1).all() and not len(found.object_class)
+
+
+def test_an_object_that_most_masks_miss_is_one_object(room):
+    """Most views show background where the lamp is, so that no cell of it is filled."""
+    masks, true, poses, lenses = frames(room)
+    lamp = np.flatnonzero(true == 7)
+    ids = np.where(np.isin(masks.ids, lamp[4:]), 0, masks.ids)
+    found = associate(masks._replace(ids=ids), poses, lenses).ids
+    assert len(np.unique(found[np.isin(ids, lamp)])) == 1
+    assert len(np.unique(found)) == 1 + len(room.things)
