@@ -15,17 +15,18 @@ written by the tests' writer.
 import argparse
 import sys
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import shapely
 import trimesh
+from handheld import swayed, walk
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from data_prep.engine.selection import read_splits
+from data_prep.frames import Y_UP
 from data_prep.front.furnished import Room
 from data_prep.front.houses import house_files
 from data_prep.front.models import ModelBank
@@ -35,7 +36,6 @@ from data_prep.public.nyu40 import LIKE_NYU40, NYU40
 from data_prep.scannet.labels import Labels, read_labels
 from data_prep.scannet.scans import ScanSettings, read_scan
 from sceneprior.core.classes import STUFF, label_set
-from sceneprior.core.overlaps import box_iou_3d
 
 sys.path.append(str(Path(__file__).parents[1] / "tests" / "data_prep" / "scannet"))
 
@@ -49,7 +49,7 @@ CATEGORIES = {
 }  # fmt: skip
 """ScanNet's category of a class of 3D-FRONT, where it has another name. Categories without a NYU40
 class are `otherfurniture`, which `prep-scannet` reads as void."""
-EDGE_M = 0.05
+EDGE_M = 0.06
 """Longest edge of the fused mesh."""
 RANGE_M = 4.0
 """Range of the depth sensor."""
@@ -57,18 +57,10 @@ BEND_M, NOISE_M = 0.01, 0.005
 """Amplitude of the bend of the fused mesh, which varies over metres, and the noise of a vertex."""
 BORDER_M, RAGGED = 0.03, 0.1
 """Vertices so near to another object belong to it with this probability."""
-HAND = 3.0, 0.03
-"""Sway of the hand in degrees and metres."""
 DRIFT = 0.5, 0.01
 """Error of a written pose in degrees and metres."""
 LOST = 0.02
 """Share of the poses that are lost."""
-EYE_M, WALL_M, AROUND_M = 1.5, 0.3, 0.2
-"""Height of the camera, and its least distances from walls and from furniture."""
-VISITS, PAN = 2, 4
-"""Pans to each object, and frames of a pan."""
-Z_UP = [2, 0, 1]
-"""Order in which the axes of a room become those of an aligned scan: data_prep/frames.py `Y_UP`."""
 MASK_SIZE = (484, 648)
 """(height, width) of the masks, half of ScanNet's."""
 
@@ -132,64 +124,7 @@ def surfaces(room: Room) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     for name, vertices, faces in parts:
         points, triangles = trimesh.remesh.subdivide_to_size(vertices, faces, EDGE_M, max_iter=20)
         points, number = np.unique(points.round(4), axis=0, return_inverse=True)
-        yield name, points[:, Z_UP], number.reshape(-1)[triangles]
-
-
-def walk(room: Room, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Places and directions, in the aligned frame, of a camera that walks over the free floor and
-    pans to one object after the other."""
-    ends = [(m.min(axis=0), m.max(axis=0)) for m in (f.mesh.vertices_m for f in room.furniture)]
-    in_the_way = [
-        shapely.box(low[0], low[2], high[0], high[2]).buffer(AROUND_M)
-        for low, high in ends
-        if low[1] < EYE_M + AROUND_M
-    ]
-    free = room.floor.buffer(-WALL_M) - shapely.union_all(in_the_way)
-    free = max(getattr(free, "geoms", [free]), key=lambda part: part.area)
-    here, yaw, pitch = np.array(free.representative_point().coords[0]), rng.uniform(-3, 3), 0.3
-    for k in np.concatenate([rng.permutation(len(ends)) for _ in range(VISITS)]):
-        target = (ends[k][0] + ends[k][1]) / 2
-        there = _next_place(free, here, target[[0, 2]], rng)
-        x, z = target[[0, 2]] - there
-        turn = (np.arctan2(x, z) - yaw + np.pi) % (2 * np.pi) - np.pi
-        tilt = np.arctan2(EYE_M - target[1], np.hypot(x, z)).clip(-0.4, 0.8) - pitch
-        for share in np.arange(1, PAN + 1) / PAN:
-            place, now, down = (
-                here + share * (there - here),
-                yaw + share * turn,
-                pitch + share * tilt,
-            )
-            ahead = np.array(
-                [np.sin(now) * np.cos(down), -np.sin(down), np.cos(now) * np.cos(down)]
-            )
-            yield np.array([place[0], EYE_M, place[1]])[Z_UP], ahead[Z_UP]
-        here, yaw, pitch = there, yaw + turn, pitch + tilt
-
-
-def _next_place(
-    free: shapely.Polygon, here: np.ndarray, target: np.ndarray, rng: np.random.Generator
-) -> np.ndarray:
-    """A place in a straight line from here, over free floor; at least 1.2 m from the target if one
-    is found."""
-    x0, z0, x1, z1 = free.bounds
-    places = [here, *rng.uniform((x0, z0), (x1, z1), (100, 2))]
-    open_ = [p for p in places if free.covers(shapely.LineString([here, p]))] or [here]
-    far = [place for place in open_[1:] if np.hypot(*(place - target)) > 1.2]
-    return far[0] if far else max(open_, key=lambda place: float(np.hypot(*(place - target))))
-
-
-def swayed(
-    poses: Sequence[np.ndarray], degrees: float, metres: float, rng: np.random.Generator
-) -> list[np.ndarray]:
-    """Turn and move poses by random changes, of this root mean square, that last a few frames."""
-    change = rng.normal(size=(len(poses), 6))
-    for k in range(1, len(poses)):
-        change[k] = 0.9 * change[k - 1] + np.sqrt(1 - 0.9**2) * change[k]
-    change /= np.sqrt(3)
-    moved = np.tile(np.eye(4), (len(poses), 1, 1))
-    moved[:, :3, :3] = Rotation.from_rotvec(np.radians(degrees) * change[:, :3]).as_matrix()
-    moved[:, :3, 3] = metres * change[:, 3:]
-    return [pose @ each for pose, each in zip(poses, moved, strict=True)]
+        yield name, points @ Y_UP[:3, :3], number.reshape(-1)[triangles]
 
 
 def scanned(room: Room, folder: Path, seed: int) -> MadeScan:
@@ -204,9 +139,8 @@ def scanned(room: Room, folder: Path, seed: int) -> MadeScan:
     alignment[:3, :3] = Rotation.from_rotvec([0, 0, rng.uniform(-np.pi, np.pi)]).as_matrix()
     alignment[:3, 3] = rng.uniform(-3, 3, 3)
     scan = MadeScan(folder, boxes, alignment)
-    for eye, ahead in walk(room, rng):
-        scan.look(eye, eye + ahead)
-    scan.true_poses = swayed(scan.poses, *HAND, rng)
+    to_scan = np.linalg.inv(Y_UP @ alignment)
+    scan.true_poses = [to_scan @ pose for pose in walk(room, rng)]
     vertices, scan.faces = trimesh.util.append_faces(points, faces)
     scan.vertices = (vertices - alignment[:3, 3]) @ alignment[:3, :3]
     scan.owner = np.repeat(np.arange(len(boxes)), [len(each) for each in points])
@@ -229,12 +163,11 @@ def overlaps(scan: MadeScan, labels: Labels) -> dict[str, list[float]]:
         if labels.is_shell(box.category):
             continue
         corners = box.corners @ to_room[:3, :3].T + to_room[:3, 3]
-        true = corners.min(axis=0), corners.max(axis=0)
-        given = (found[k].lower_m, found[k].upper_m) if k in found else (np.zeros(3), np.zeros(3))
-        (a, size_a), (b, size_b) = (
-            ((low + high)[None] / 2, (high - low)[None]) for low, high in (true, given)
-        )
-        scores[labels.label(box.category)].append(float(box_iou_3d(a, size_a, b, size_b)[0, 0]))
+        lower, upper = corners.min(axis=0), corners.max(axis=0)
+        low, high = (found[k].lower_m, found[k].upper_m) if k in found else np.zeros((2, 3))
+        shared = np.clip(np.minimum(upper, high) - np.maximum(lower, low), 0, None).prod()
+        both = (upper - lower).prod() + (high - low).prod() - shared
+        scores[labels.label(box.category)].append(float(shared / both))
     return scores
 
 
