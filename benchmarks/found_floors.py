@@ -6,8 +6,8 @@ The shards must hold stuff and 3D ground truth, like those of `prep-front`. A wa
 larger distance of its ends from the line through the nearest true side. A true side counts as found
 if walls cover half of it. `--homes` is the folder of the houses, for the true doors; a door is
 found if both ends are within 15 cm. With `--noisy`, each pose is displaced by 1 cm and 0.5 degrees,
-the outlines of masks are displaced by a standard deviation of one pixel in images with 240 pixels
-along the longer side, and the poses are then corrected as by `prep-posed`.
+and corrected from the masks of objects as by `prep-posed`; the outlines of floors and walls are
+displaced by a standard deviation of one pixel in images with 240 pixels along the longer side.
 """
 
 import argparse
@@ -129,31 +129,21 @@ def true_doors(homes: Path | None) -> dict[str, list[np.ndarray]]:
 
 
 def spoilt(views: RoomViews, seed: int) -> RoomViews:
-    """A room with displaced poses and ragged masks, after the corrections of `prep-posed`."""
+    """A room with displaced poses and ragged floors and walls, after the corrections of
+    `prep-posed`."""
     assert views.stuff is not None and views.instance_ids is not None
     rng = np.random.default_rng(seed)
     poses = np.stack(
         [moved(pose, NOISES["noisy"], rng) for pose in views.world_to_camera.astype(np.float64)]
     )
+    number, *places = np.indices(views.stuff.shape)
     moves = []
-    for _ in views.stuff.shape[1:]:
+    for place, side in zip(places, views.stuff.shape[1:], strict=True):
         field = ndimage.gaussian_filter(rng.normal(size=views.stuff.shape), (0, WAVE_PX, WAVE_PX))
-        moves.append(np.rint(WAVER_PX * field / field.std()).astype(int))
-    thin = round(views.instance_ids.shape[1] / views.stuff.shape[1])
-    finer = [thin * move.repeat(thin, axis=1).repeat(thin, axis=2) for move in moves]
-    ids = _ragged(views.instance_ids, finer)
-    seen = observed(views, ids.astype(np.int64), views.object_class, poses)
-    return replace(seen, stuff=_ragged(views.stuff, moves))
-
-
-def _ragged(images: np.ndarray, moves: list[np.ndarray]) -> np.ndarray:
-    """Images whose pixels come from other rows and columns."""
-    number, *places = np.indices(images.shape)
-    rows, columns = (
-        np.clip(place + move[:, : images.shape[1], : images.shape[2]], 0, side - 1)
-        for place, move, side in zip(places, moves, images.shape[1:], strict=True)
-    )
-    return images[number, rows, columns]
+        moved_to = place + np.rint(WAVER_PX * field / field.std()).astype(int)
+        moves.append(np.clip(moved_to, 0, side - 1))
+    seen = observed(views, views.instance_ids.astype(np.int64), views.object_class, poses)
+    return replace(seen, stuff=views.stuff[number, *moves])
 
 
 def rows(scores: list[Score]) -> Iterator[str]:

@@ -11,8 +11,6 @@ from pathlib import Path
 import numpy as np
 from scan_files import TABLE, Box, ScanFolder, alignment
 
-from sceneprior.render.offscreen.zbuffer import rasterize
-
 VOXEL_M = 0.04
 ROOM_TABLE = [
     *TABLE,
@@ -54,17 +52,9 @@ class RoomScan(ScanFolder):
 
     def mask(self, frame, size=None):
         """A triangle is of the object that has most of its corners."""
-        height, width = size or self.size
-        vertices, faces, _ = self.mesh
-        owner = self.labelled[2][faces]
+        owner = self.labelled[2][self.labelled[1]]
         most = np.where(owner[:, 1] == owner[:, 2], owner[:, 1], owner[:, 0])
-        down, across = height / self.size[0], width / self.size[1]
-        lens = (
-            self.K[0, 0] * across, self.K[1, 1] * down,
-            (self.K[0, 2] + 0.5) * across, (self.K[1, 2] + 0.5) * down,
-        )  # fmt: skip
-        camera = np.linalg.inv(self.poses[frame])
-        index, _ = rasterize(vertices, faces, camera, lens, (height, width))
+        index, _ = self.nearest(self.poses[frame], size or self.size)
         values = np.zeros(UNLABELLED + 2, dtype=np.uint8)
         values[[k + 1 for k in range(len(self.boxes))]] = [k + 1 for k in self.ids]
         return np.where(index < 0, 0, values[most[index] + 1]).astype(np.uint8)

@@ -175,23 +175,24 @@ class ScanFolder:
 
     def mask(self, frame: int, size: tuple[int, int] | None = None) -> np.ndarray:
         """(H, W) uint8, objectId + 1 of what is nearest in each pixel."""
+        if not np.isfinite(self.poses[frame]).all():
+            return np.zeros(size or self.size, dtype=np.uint8)
+        index, _ = self.nearest(self.poses[frame], size or self.size)
+        values = np.array([0, *[k + 1 for k in self.ids]], dtype=np.uint8)
+        return values[(index + len(BOX_FACES)) // len(BOX_FACES)]
+
+    def nearest(self, pose: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+        """Nearest triangle of the mesh (-1 = none), and its depth, in each pixel."""
         from sceneprior.render.offscreen.zbuffer import rasterize
 
-        height, width = size or self.size
-        down, across = height / self.size[0], width / self.size[1]
+        down, across = size[0] / self.size[0], size[1] / self.size[1]
         vertices, faces, _ = self.mesh
         # ScanNet counts pixel centres in whole numbers, the rasteriser puts them at one half.
         lens = (
             self.K[0, 0] * across, self.K[1, 1] * down,
             (self.K[0, 2] + 0.5) * across, (self.K[1, 2] + 0.5) * down,
         )  # fmt: skip
-        if not np.isfinite(self.poses[frame]).all():
-            return np.zeros((height, width), dtype=np.uint8)
-        index, _ = rasterize(
-            vertices, faces, np.linalg.inv(self.poses[frame]), lens, (height, width)
-        )
-        values = np.array([0, *[k + 1 for k in self.ids]], dtype=np.uint8)
-        return values[(index + len(BOX_FACES)) // len(BOX_FACES)]
+        return rasterize(vertices, faces, np.linalg.inv(pose), lens, size)
 
     def write(self, mask_size: tuple[int, int] | None = None, **changes: Any) -> "ScanFolder":
         """Write every file but those whose ending is given as None: `sens=None`."""
