@@ -20,6 +20,9 @@ OFF, LARGER = 0.6, 2.0
 sizes, that have a misfit of 1 each."""
 MISFIT = 1.5
 """Maximum misfit of a mask to a ball."""
+MOST = 200
+"""Maximum number of single masks of a class: more of them mean that poses are wrong, and every pair
+is compared with every mask."""
 _DIGITS = 6
 """Decimals of misfits, so that last bits do not matter."""
 
@@ -100,12 +103,15 @@ def join_singles(
     """Join masks of one class that are alone in their clusters, and that show the same ball.
 
     Of the balls of all pairs, the one that most views show is chosen, and of those the one with the
-    smallest mean misfit. Its masks are joined, and the next ball is chosen from the others.
+    smallest mean misfit. Its masks are joined, and the next ball is chosen from the others. If a
+    class has more than `MOST` single masks, they stay alone.
     """
     labels = labels.copy()
     alone = (np.bincount(labels)[labels] == 1) & (discs.radii > 0)
     for name in np.unique(mask_class[alone]).tolist():
         own = np.flatnonzero(alone & (mask_class == name))
+        if len(own) > MOST:
+            continue
         for joined in _groups(Discs(*(each[own] for each in discs)), mask_view[own]):
             labels[own[joined]] = labels[own[joined[0]]]
     renumbered: Int[np.ndarray, " masks"] = np.unique(labels, return_inverse=True)[1]

@@ -163,7 +163,7 @@ def test_only_borders_are_ragged(rng: np.random.Generator):
 
 
 def test_hidden_surfaces_are_not_fused(tmp_path: Path, rng: np.random.Generator):
-    """Of a box, only the front that faces the camera is kept, and nothing of the box behind it."""
+    """The front of a box, which faces the camera, is kept, and nothing of the box behind it."""
     boxes = [Box("bed", (-1, 0, 0), (1, 1, 1)), Box("chair", (-0.5, 2, 0), (0.5, 3, 1))]
     scan = MadeScan(tmp_path / "scene0000_00", boxes, np.eye(4))
     _, scan.faces, _ = ScanFolder(tmp_path, boxes, np.eye(4)).mesh

@@ -166,9 +166,8 @@ def _needed(every: RayFit, guess: Guess) -> Guess:
     row = 0
     while row < len(guess.kinds) > 1:
         trial = every.without(guess, row)
-        if faults_of(every, trial) <= faults_of(every, guess) and every.loss(trial) < every.loss(
-            guess
-        ):
+        cheaper = every.loss(trial) < every.loss(guess)
+        if cheaper and faults_of(every, trial) <= faults_of(every, guess):
             guess, row = trial, 0
         else:
             row += 1

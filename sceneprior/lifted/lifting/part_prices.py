@@ -90,8 +90,8 @@ def solids_of(mirrored, ends, area):
 def overhang(mirrored, ends, area):
     """Distance in levels, along x plus along z, from the rectangle around the lowest parts to the
     parts' centre of volume or to the middle of the box, whichever is further away. With the centre
-    outside, an object tips over; with the middle outside, it stands on one side alone, as no
-    furniture does."""
+    outside, an object tips over; with the middle outside, it stands on one side alone, as
+    furniture hardly ever does."""
     solids = solids_of(mirrored, ends, area)
     if not len(solids):
         return 0.0
