@@ -56,7 +56,7 @@ ELSEWHERE = {
     "make demo": "tests/apps/experiments/test_demo.py runs the command that it is",
     "make test": "this is it",
     "out/small/": "tests/test_readme.py runs the block with nothing cut short",
-    "compare/new_rooms_small.yaml": "tests/apps/experiments/test_compare.py compares toys",
+    "compare/paper.yaml": "tests/apps/experiments/test_compare.py compares toys",
     "compare/single_view.yaml": "tests/apps/experiments/test_compare_views.py compares toys",
     "--devices 2": "tests/training/test_processes.py trains in two processes",
     "--devices 4 --resume": "tests/training/test_slurm.py is stopped and queued again as there",

@@ -24,7 +24,7 @@ def compare(
     config: Annotated[
         str,
         typer.Option(help="Comparison: your YAML, or a shipped one (compare/single_view.yaml)."),
-    ] = "compare/new_rooms_small.yaml",
+    ] = "compare/paper.yaml",
     out: Annotated[Path, typer.Option(help="Folder for runs and tables.")] = Path("out/compare"),
     methods: Annotated[str | None, typer.Option(help="Methods, such as lifted,lstm.")] = None,
     rooms: Annotated[str | None, typer.Option(help="Kinds of rooms, such as bedroom.")] = None,

@@ -27,6 +27,8 @@ class Rooms(Section):
 
     config: str
     """Run config of the paper's or the lifted method; all methods use the rooms of this config."""
+    set: tuple[str, ...] = Field((), strict=False)
+    """Changes to the config as `section.key=value`, for example other shards."""
     title: str
     """Heading of the table of these rooms."""
 
@@ -241,20 +243,21 @@ def runs_of(comparison: Comparison, out: Path) -> list[Run]:
             folder = out / key / name
             if seed is None and key in method.scenes:
                 scenes = Path(method.scenes[key])
-                runs.append(Run(key, name, None, rooms.config, (), folder, scenes))
+                runs.append(Run(key, name, None, rooms.config, rooms.set, folder, scenes))
             elif seed is not None and not method.scenes:
                 changes = (*method.set.get(EVERY, ()), *method.set.get(key, ()))
-                settings = (*_taken_over(rooms, method), *changes, f"seed={seed}")
+                settings = (*_of_rooms(rooms, method), *changes, f"seed={seed}")
                 config = method.config or rooms.config
                 runs.append(Run(key, name, seed, config, settings, folder / f"seed{seed}"))
     return runs
 
 
-def _taken_over(rooms: Rooms, method: Method) -> list[str]:
-    """Settings that a method with its own config takes from the config of the rooms."""
+def _of_rooms(rooms: Rooms, method: Method) -> list[str]:
+    """Settings that a method takes from its rooms: their changes to the config that both share, or
+    a few values for a config of its own."""
     if method.config is None:
-        return []
-    shared, own = read_settings(rooms.config)[1], read_settings(method.config)[1]
+        return list(rooms.set)
+    shared, own = read_settings(rooms.config, rooms.set)[1], read_settings(method.config)[1]
     keys = ["label_set", "data.shards"]
     if _value(own, "model.max_objects") is not None:
         keys.append("model.max_objects")
@@ -299,4 +302,5 @@ def variants_of(comparison: Comparison, run: Run) -> list[Variant]:
 
 def shards_of(comparison: Comparison, rooms: str) -> Path:
     """The folder of shards that holds a kind of rooms."""
-    return Path(load_config(comparison.rooms[rooms].config).data.shards)
+    kind = comparison.rooms[rooms]
+    return Path(load_config(kind.config, kind.set).data.shards)
