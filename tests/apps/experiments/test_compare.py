@@ -60,6 +60,24 @@ def test_every_run_has_its_settings_its_seed_and_its_folder(written):
     assert runs[3].folder == Path("out/toy/lstm/seed1")
 
 
+def test_rooms_change_the_config_that_methods_share(written, tmp_path):
+    rooms = {"title": "Toys", "config": str(tmp_path / "tiny.yaml")}
+    more = {"more": {**rooms, "title": "More", "set": ["model.max_objects=2", "layout.epochs=9"]}}
+    own = tmp_path / "gan.yaml"
+    own.write_text(yaml.safe_dump(tiny_baseline_settings(Path("elsewhere"), "gan")))
+    gan = {"title": "GAN", "config": str(own)}
+    lstm = {**METHODS["lstm"], "set": {"more": ["layout.epochs=8"]}}
+    methods = {"ours": {}, "lstm": lstm, "gan": gan}
+    runs = runs_of(load_comparison(written(rooms={"toy": rooms, **more}, methods=methods)), Path())
+    configs = {(run.rooms, run.method): run.run_config for run in runs}
+    assert {key: config.layout.epochs for key, config in configs.items() if key[1] != "gan"} == {
+        ("toy", "ours"): 1, ("toy", "lstm"): 1, ("more", "ours"): 9, ("more", "lstm"): 8,
+    }  # fmt: skip
+    found = {key: config.model.max_objects for key, config in configs.items()}
+    assert {found["more", name] for name in methods} == {2}
+    assert 2 not in {found["toy", name] for name in methods}
+
+
 def test_a_method_with_a_config_of_its_own_learns_from_the_same_rooms(written, tmp_path):
     own = tmp_path / "gan.yaml"
     settings = tiny_baseline_settings(Path("elsewhere"), "gan", model__max_objects=3)
