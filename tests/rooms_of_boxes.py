@@ -1,11 +1,14 @@
 """Rooms, shapes and a small sampler for tests, made from numbers alone."""
 
+from pathlib import Path
+
 import numpy as np
 import torch
 from parts_of_rooms import boxes, rays_of
 
 from sceneprior.core.parts import Parts, filled_cells
 from sceneprior.core.wall_lines import Wall
+from sceneprior.lifted.lifting.cache import LiftedCache
 from sceneprior.lifted.lifting.dataset import LiftedDataset
 from sceneprior.lifted.lifting.lifted import LiftedBoxes, RayPool, ShapeGrid
 from sceneprior.lifted.looks import LookConfig, LookDecoder
@@ -29,6 +32,7 @@ class Lifted(LiftedDataset):
 
     def __init__(self, boxes: list[LiftedBoxes], classes: list[int], shapes: list[Parts]):
         self.rotations, self.label_set, self.boxes = 1, "toy", boxes
+        self._cache = LiftedCache(Path("no folder"), "train", [], "")
         self.plain_ids = [f"room{row}" for row in range(len(boxes))]
         self.object_classes = np.array(classes, dtype=np.int64)
         self._shape = ShapeGrid(CELLS, 1.0)

@@ -17,8 +17,7 @@ from sceneprior.core.errors import ShardError
 from sceneprior.core.geometry.turns import turn_boxes, turn_grids
 from sceneprior.core.shards import iterate_rooms
 from sceneprior.core.wall_lines import find_walls
-from sceneprior.lifted.lifting import boxes, shapes
-from sceneprior.lifted.lifting import dataset as module
+from sceneprior.lifted.lifting import boxes, cache, kinds, shapes
 from sceneprior.lifted.lifting.dataset import LiftedDataset
 from sceneprior.lifted.lifting.kinds import looks_of
 from sceneprior.lifted.lifting.lifted import RayPool, ShapeGrid
@@ -116,6 +115,23 @@ def test_shapes_are_found_once_and_again_on_other_grids(shards, monkeypatch):
     assert len(calls) == 6
 
 
+def test_parts_are_found_once_and_again_for_other_prototypes(shards, monkeypatch):
+    first = LiftedDataset(shards, "train", shape=GRID).find_prototypes(99)
+    calls = []
+    fit = kinds.fit_kinds
+    monkeypatch.setattr(kinds, "fit_kinds", lambda *given: calls.append(1) or fit(*given))
+    data = LiftedDataset(shards, "train", shape=GRID)
+    again = data.find_prototypes(99)
+    assert calls == [] and len(first.parts) == len(again.parts) > 1
+    for one, other in zip(first.parts, again.parts, strict=True):
+        for mine, theirs in zip(one, other, strict=True):
+            np.testing.assert_array_equal(mine, theirs, strict=True)
+    np.testing.assert_array_equal(first.grids, again.grids)
+    # Other prototypes.
+    data.object_classes[data.object_classes == data.object_classes[0]] = VOID
+    assert len(data.find_prototypes(99).parts) < len(first.parts) and calls == [1]
+
+
 def test_boxes_are_found_once_and_again_when_views_change(shards, monkeypatch):
     first = LiftedDataset(shards, "train")
     calls = []
@@ -171,7 +187,7 @@ def test_a_read_only_folder_is_enough(shards, monkeypatch):
     def refuse(*_):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(module, "write_whole", refuse)
+    monkeypatch.setattr(cache, "write_whole", refuse)
     assert len(LiftedDataset(shards, "train").boxes) == 6
     assert not (shards / "lifted_train.npz").exists()
 
@@ -188,6 +204,6 @@ def test_walls_are_found_once_in_the_views_that_training_uses(tmp_path, monkeypa
     used = allowed_views(0, 1, len(room.visible), 0.5)
     for mine, theirs in zip(walls, find_walls(room, used)[0], strict=True):
         np.testing.assert_array_equal(np.hstack(mine), np.hstack(theirs))
-    monkeypatch.setattr(module, "find_walls", None)
+    monkeypatch.setattr(cache, "find_walls", None)
     again = LiftedDataset(tmp_path, "train", view_fraction=0.5).walls()[1]
     np.testing.assert_array_equal([np.hstack(w) for w in again], [np.hstack(w) for w in walls])

@@ -1,0 +1,184 @@
+"""Boxes, shapes, walls and parts lifted from masks, cached as files beside the shards.
+
+A file is found again when its inputs or its version changes, and is left out if the folder is not
+writable.
+"""
+
+import contextlib
+import hashlib
+import io
+import zipfile
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Int
+from rich.console import Console
+from rich.progress import track
+
+from sceneprior.core.files import write_whole
+from sceneprior.core.parts import Parts
+from sceneprior.core.shards import RoomViews, Shard, iterate_rooms
+from sceneprior.core.wall_lines import Wall, find_walls
+from sceneprior.lifted.lifting.lifted import LiftedBoxes, ShapeGrid
+
+VERSION = 2
+"""Version of the cached boxes."""
+SHAPES_VERSION = 5
+"""Version of the cached hulls and rays."""
+PARTS_VERSION = 1
+"""Version of the cached parts. Increase a version when results change."""
+WALLS_VERSION = 1
+"""Version of the cached walls."""
+
+RAYS_KEPT = 1024
+"""Number of rays per object from which its shape is found."""
+
+
+class LiftedCache(NamedTuple):
+    """What is lifted from the masks of a split: computed once, then read from files."""
+
+    folder: Path
+    """Folder of the shards."""
+    split: str
+    chosen: Sequence[Int[np.ndarray, " views"]]
+    """The views to use, for each room of the split."""
+    key: str
+    """Hash of the input (`fingerprint`)."""
+
+    def boxes(self, counts: Sequence[int]) -> list[LiftedBoxes]:
+        """Boxes of each room, which has `counts` objects."""
+
+        def find() -> dict[str, np.ndarray]:
+            # Imported only where something is lifted, here and below: Numba is slow to import.
+            from sceneprior.lifted.lifting.boxes import lift_boxes
+
+            found = [
+                lift_boxes(shard.read_room(room_id, images=True), views)
+                for views, shard, room_id in self._rooms("lifting boxes from masks (rooms)")
+            ]
+            return {
+                name: np.concatenate([getattr(room, name) for room in found])
+                for name in LiftedBoxes._fields
+            }
+
+        saved = _kept(self.folder / f"lifted_{self.split}.npz", self.key, find)
+        parts = [np.split(saved[name], np.cumsum(counts)[:-1]) for name in LiftedBoxes._fields]
+        return [LiftedBoxes(*each) for each in zip(*parts, strict=True)]
+
+    def shapes(self, boxes: Sequence[LiftedBoxes], grid: ShapeGrid) -> dict[str, np.ndarray]:
+        """Visual hulls (`bits`), packed to eight cells per byte, and the fields of a `RayPool`, of
+        all objects, whose boxes are given by room."""
+
+        def find() -> dict[str, np.ndarray]:
+            from sceneprior.lifted.lifting.rays import draw_rays
+            from sceneprior.lifted.lifting.shapes import lift_shapes
+
+            hulls, rays = [], []
+            for its_boxes, (views, shard, room_id) in zip(
+                boxes, self._rooms("lifting shapes from masks (rooms)"), strict=True
+            ):
+                room = shard.read_room(room_id, images=True)
+                hulls.append(lift_shapes(room, its_boxes, grid, views))
+                rays.append(draw_rays(room, its_boxes, RAYS_KEPT, grid.margin, views))
+            grids = np.concatenate(hulls)
+            starts, spans, hits = (np.concatenate(part) for part in zip(*rays, strict=True))
+            return {
+                "bits": np.packbits(grids.reshape(len(grids), -1), axis=1),
+                "starts": starts.astype(np.float16),
+                "spans": spans.astype(np.float16),
+                "hits": hits,
+            }
+
+        return _kept(self.folder / f"lifted_shapes_{self.split}.npz", self._shapes_key(grid), find)
+
+    def parts(
+        self,
+        items: Int[np.ndarray, " prototypes"],
+        grid: ShapeGrid,
+        fit: Callable[[], tuple[Parts, ...]],
+    ) -> tuple[Parts, ...]:
+        """Parts of the prototypes, which are the objects `items`; `fit` finds them."""
+
+        def find() -> dict[str, np.ndarray]:
+            found = fit()
+            columns = zip(Parts._fields, zip(*found, strict=True), strict=True)
+            counts = np.array([(len(each.kind), len(each.outline)) for each in found])
+            return {name: np.concatenate(column) for name, column in columns} | {"counts": counts}
+
+        chosen = hashlib.sha256(items.tobytes()).hexdigest()
+        key = f"{self._shapes_key(grid)} {PARTS_VERSION} {chosen}"
+        saved = _kept(self.folder / f"lifted_parts_{self.split}.npz", key, find)
+        solids, corners = np.cumsum(saved["counts"], axis=0)[:-1].T
+        columns = [
+            np.split(saved[name], corners if name == "outline" else solids)
+            for name in Parts._fields
+        ]
+        return tuple(Parts(*each) for each in zip(*columns, strict=True))
+
+    def walls(self) -> list[list[Wall]]:
+        """Walls of each room; none if its shard has no stuff."""
+
+        def find() -> dict[str, np.ndarray]:
+            found = [
+                find_walls(shard.read_room(room_id, images=True), views)[0]
+                if shard.has_stuff(room_id)
+                else ()
+                for views, shard, room_id in self._rooms("finding walls in masks (rooms)")
+            ]
+            rows = [np.hstack(wall) for walls in found for wall in walls]
+            return {
+                "walls": np.array(rows).reshape(-1, 7),
+                "counts": np.array([len(walls) for walls in found]),
+            }
+
+        key = f"{self.key} {WALLS_VERSION}"
+        saved = _kept(self.folder / f"lifted_walls_{self.split}.npz", key, find)
+        parts = np.split(saved["walls"], np.cumsum(saved["counts"])[:-1])
+        return [
+            [Wall(row[:2], row[2:4], row[4:6], float(row[6])) for row in part] for part in parts
+        ]
+
+    def _shapes_key(self, grid: ShapeGrid) -> str:
+        return f"{self.key} {SHAPES_VERSION} {grid.cells} {grid.margin}"
+
+    def _rooms(self, words: str) -> Iterator[tuple[np.ndarray, Shard, str]]:
+        """The chosen views, shard and id of each room, with a progress bar called `words`."""
+        rooms = iterate_rooms(self.folder, self.split)
+        progress = track(self.chosen, words, console=Console(stderr=True))
+        for views, (shard, room_id) in zip(progress, rooms, strict=True):
+            yield views, shard, room_id
+
+
+def _kept(path: Path, key: str, find: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Read the arrays cached in a file under this key. If they are missing, compute them, and cache
+    them if the file is writable."""
+    try:
+        with np.load(path) as saved:
+            if str(saved["key"]) == key:
+                return {name: saved[name] for name in saved.files}
+    except (OSError, KeyError, ValueError, zipfile.BadZipFile):
+        pass  # missing or damaged: computed again
+    found = find()
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, key=np.array(key), **found)
+    with contextlib.suppress(OSError):  # a read-only folder gets no cache
+        write_whole(path, buffer.getvalue())
+    return found
+
+
+def fingerprint(
+    rooms: Sequence[RoomViews], checksums: Sequence[str | None], chosen: Sequence[np.ndarray]
+) -> str:
+    """Hash of everything from which boxes and shapes are computed. A room's checksum covers its
+    images; for old shards without checksums, measurements taken from the images replace it."""
+    summary = hashlib.sha256(f"lifted {VERSION}".encode())
+    for room, checksum, views in zip(rooms, checksums, chosen, strict=True):
+        summary.update(f"{room.room_id} {checksum}".encode())
+        for array in (
+            room.object_class, room.boxes, room.mask_pixels, room.sides_clear,
+            room.world_to_camera, room.intrinsics, views,
+        ):  # fmt: skip
+            summary.update(np.ascontiguousarray(array).data)
+    return summary.hexdigest()
