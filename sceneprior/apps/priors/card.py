@@ -130,6 +130,6 @@ def _limits(trained: Trained, latents: bool, half: bool) -> list[str]:
     if half:
         limits.append(
             "Large tensors are stored in half precision, so rooms differ slightly from those of "
-            "the run, for which the scores were computed."
+            "the run."
         )
     return ["\n".join(f"- {limit}" for limit in limits)]
