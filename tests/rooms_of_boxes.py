@@ -1,6 +1,5 @@
 """Rooms, shapes and a small sampler for tests, made from numbers alone."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +32,7 @@ class Lifted(LiftedDataset):
 
     def __init__(self, boxes: list[LiftedBoxes], classes: list[int], shapes: list[Parts]):
         self.rotations, self.label_set, self.boxes = 1, "toy", boxes
-        self._cache = LiftedCache(Path(os.devnull), "train", [], "")  # where nothing can be written
+        self._cache = LiftedCache(Path("no folder"), "train", [], "")
         self.plain_ids = [f"room{row}" for row in range(len(boxes))]
         self.object_classes = np.array(classes, dtype=np.int64)
         self._shape = ShapeGrid(CELLS, 1.0)

@@ -26,9 +26,10 @@ from sceneprior.lifted.lifting.lifted import LiftedBoxes, ShapeGrid
 VERSION = 2
 """Version of the cached boxes."""
 SHAPES_VERSION = 5
-"""Version of the cached hulls and rays."""
+"""Version of the cached hulls and rays. Increase a version when results change."""
 PARTS_VERSION = 1
-"""Version of the cached parts. Increase a version when results change."""
+"""Version of the cached parts: increase it when `kinds.py`, `part_fit.py` and what it imports,
+`outlines.py`, `ALIKE` or `HANGS_M` change; delete `lifted_parts_*.npz` while trying settings."""
 WALLS_VERSION = 1
 """Version of the cached walls."""
 
@@ -158,13 +159,14 @@ def _kept(path: Path, key: str, find: Callable[[], dict[str, np.ndarray]]) -> di
         with np.load(path) as saved:
             if str(saved["key"]) == key:
                 return {name: saved[name] for name in saved.files}
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile):
+    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile):
         pass  # missing or damaged: computed again
     found = find()
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, key=np.array(key), **found)
-    with contextlib.suppress(OSError):  # a read-only folder gets no cache
-        write_whole(path, buffer.getvalue())
+    if path.parent.is_dir():  # no folder is created
+        with contextlib.suppress(OSError):
+            write_whole(path, buffer.getvalue())
     return found
 
 

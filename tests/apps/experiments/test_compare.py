@@ -14,7 +14,13 @@ from toy_metrics import without_classifiers
 
 from sceneprior.apps.config import load_any_run, load_config
 from sceneprior.apps.experiments.compare import Compared, CompareOptions, compare, scoring_steps
-from sceneprior.apps.experiments.comparison import load_comparison, part_of, runs_of, variants_of
+from sceneprior.apps.experiments.comparison import (
+    load_comparison,
+    part_of,
+    runs_of,
+    shards_of,
+    variants_of,
+)
 from sceneprior.apps.experiments.rows import costs_of
 from sceneprior.apps.experiments.steps import StepRunner
 from sceneprior.core.errors import InputError
@@ -62,20 +68,28 @@ def test_every_run_has_its_settings_its_seed_and_its_folder(written):
 
 def test_rooms_change_the_config_that_methods_share(written, tmp_path):
     rooms = {"title": "Toys", "config": str(tmp_path / "tiny.yaml")}
-    more = {"more": {**rooms, "title": "More", "set": ["model.max_objects=2", "layout.epochs=9"]}}
+    changes = ["data.shards=large", "model.max_objects=2", "layout.epochs=9"]
+    kinds = {"toy": rooms, "more": {**rooms, "title": "More", "set": changes}}
     own = tmp_path / "gan.yaml"
     own.write_text(yaml.safe_dump(tiny_baseline_settings(Path("elsewhere"), "gan")))
-    gan = {"title": "GAN", "config": str(own)}
-    lstm = {**METHODS["lstm"], "set": {"more": ["layout.epochs=8"]}}
-    methods = {"ours": {}, "lstm": lstm, "gan": gan}
-    runs = runs_of(load_comparison(written(rooms={"toy": rooms, **more}, methods=methods)), Path())
-    configs = {(run.rooms, run.method): run.run_config for run in runs}
+    trained = {
+        "ours": {},
+        "lstm": {**METHODS["lstm"], "set": {"more": ["layout.epochs=8"]}},
+        "gan": {"title": "GAN", "config": str(own)},
+    }
+    theirs = {"theirs": {"title": "Theirs", "scenes": {"more": "theirs"}}}
+    comparison = load_comparison(written(rooms=kinds, methods=trained | theirs))
+    runs = {(run.rooms, run.method): run for run in runs_of(comparison, Path())}
+    configs = {key: run.run_config for key, run in runs.items()}
     assert {key: config.layout.epochs for key, config in configs.items() if key[1] != "gan"} == {
         ("toy", "ours"): 1, ("toy", "lstm"): 1, ("more", "ours"): 9, ("more", "lstm"): 8,
+        ("more", "theirs"): 9,
     }  # fmt: skip
-    found = {key: config.model.max_objects for key, config in configs.items()}
-    assert {found["more", name] for name in methods} == {2}
-    assert 2 not in {found["toy", name] for name in methods}
+    assert {configs["more", name].model.max_objects for name in trained} == {2}
+    assert {configs["more", name].data.shards for name in trained} == {"large"}
+    assert shards_of(comparison, "more") == Path("large") != shards_of(comparison, "toy")
+    (step,) = scoring_steps(comparison, runs["more", "theirs"], 4, SOFTWARE)
+    assert step.arguments[step.arguments.index("--shards") + 1] == "large"
 
 
 def test_a_method_with_a_config_of_its_own_learns_from_the_same_rooms(written, tmp_path):

@@ -15,6 +15,7 @@ from sceneprior.core.classes import VOID
 from sceneprior.core.data.dataset import BLANK, ViewDataset, allowed_views
 from sceneprior.core.errors import ShardError
 from sceneprior.core.geometry.turns import turn_boxes, turn_grids
+from sceneprior.core.parts import whole_box
 from sceneprior.core.shards import iterate_rooms
 from sceneprior.core.wall_lines import find_walls
 from sceneprior.lifted.lifting import boxes, cache, kinds, shapes
@@ -116,20 +117,29 @@ def test_shapes_are_found_once_and_again_on_other_grids(shards, monkeypatch):
 
 
 def test_parts_are_found_once_and_again_for_other_prototypes(shards, monkeypatch):
+    (shards / "lifted_parts_train.npz").unlink(missing_ok=True)
+    fitted, fit = [], kinds.fit_kinds
+    monkeypatch.setattr(kinds, "fit_kinds", lambda *given: fitted.append(fit(*given)) or fitted[-1])
     first = LiftedDataset(shards, "train", shape=GRID).find_prototypes(99)
-    calls = []
-    fit = kinds.fit_kinds
-    monkeypatch.setattr(kinds, "fit_kinds", lambda *given: calls.append(1) or fit(*given))
     data = LiftedDataset(shards, "train", shape=GRID)
     again = data.find_prototypes(99)
-    assert calls == [] and len(first.parts) == len(again.parts) > 1
-    for one, other in zip(first.parts, again.parts, strict=True):
-        for mine, theirs in zip(one, other, strict=True):
-            np.testing.assert_array_equal(mine, theirs, strict=True)
+    assert len(fitted) == 1 and len(first.parts) > 1
+    for wanted, one, other in zip(fitted[0], first.parts, again.parts, strict=True):
+        for name in wanted._fields:
+            value = getattr(wanted, name)
+            np.testing.assert_array_equal(getattr(one, name), value, strict=True)
+            np.testing.assert_array_equal(getattr(other, name), value, strict=True)
     np.testing.assert_array_equal(first.grids, again.grids)
     # Other prototypes.
     data.object_classes[data.object_classes == data.object_classes[0]] = VOID
-    assert len(data.find_prototypes(99).parts) < len(first.parts) and calls == [1]
+    assert len(data.find_prototypes(99).parts) < len(first.parts) and len(fitted) == 2
+
+
+def test_a_folder_that_is_gone_stays_gone(tmp_path):
+    gone = cache.LiftedCache(tmp_path / "gone", "train", [], "")
+    parts = (whole_box(), whole_box()._replace(outline=whole_box().outline[:3]))
+    found = gone.parts(np.array([3, 4]), GRID, lambda: parts)
+    assert [len(each.outline) for each in found] == [4, 3] and not gone.folder.exists()
 
 
 def test_boxes_are_found_once_and_again_when_views_change(shards, monkeypatch):
