@@ -165,7 +165,7 @@ def _kept(path: Path, key: str, find: Callable[[], dict[str, np.ndarray]]) -> di
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, key=np.array(key), **found)
     if path.parent.is_dir():  # no folder is created
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError):  # a read-only folder gets no cache
             write_whole(path, buffer.getvalue())
     return found
 
