@@ -38,7 +38,7 @@ RAYS_KEPT = 1024
 
 
 class LiftedCache(NamedTuple):
-    """What is lifted from the masks of a split: computed once, then read from files."""
+    """Boxes, shapes, parts and walls of a split: lifted from masks once, then read from files."""
 
     folder: Path
     """Folder of the shards."""
