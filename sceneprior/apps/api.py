@@ -115,8 +115,8 @@ class Prior:
             floor: Requested floor: `"4x3"` (metres along x and z), a list of corners [x, z], or
                 a file with a floor.
             openings: Requested doors and windows, such as `"door,window@north"`, or a list.
-            ceiling_m: Requested height of the ceiling. want: Wishes: a sentence, or numbers of
-            objects by class, such as
+            ceiling_m: Requested height of the ceiling.
+            want: Wishes: a sentence, or numbers of objects by class, such as
                 `{"nightstand": 2, "desk": 0}`.
             objects: Objects that are already in the room, in the coordinates of the floor.
             cad: Replace decoded meshes by the most similar models of the package's own furniture

@@ -78,9 +78,9 @@ def nearest_distances(
     be compared with is inf.
 
     Args:
-        pass_over_own: Skip the training room that has the scene's name, so that no training room is
-        compared with itself. as_copies: Compare only with rooms of the same furniture, up to one
-        object more or fewer, and average over pairs only: an unpaired object costs nothing.
+        pass_over_own: Skip the training room with the scene's name, so that none meets itself.
+        as_copies: Compare only with rooms of the same furniture, up to one object more or fewer,
+            and average over pairs only: an unpaired object costs nothing.
     """
     rooms = _Rooms(training)
     names = np.array([room.name for room in training])

@@ -55,8 +55,8 @@ def evaluate_run(
     The options' seed also draws the latents; `shards` and `distribution` default to the run's.
 
     Args:
-        use: Also compute metrics of use; without shards, compute only these. asked: Request for the
-        rooms, as arguments of `Prior.sample`; only with `use`.
+        use: Also compute metrics of use; without shards, compute only these.
+        asked: Request for the rooms, as arguments of `Prior.sample`; only with `use`.
     """
     trained = load_any_run(run)
     folder = shards or Path(trained.config.data.shards)

@@ -75,9 +75,9 @@ def read_own_image(
     Classes outside the run's label set are replaced by `SAME_CLASS`, or else by void.
 
     Args:
-        mask: A PNG of ids, or COCO's JSON, which also has the classes. pose: File for `read_pose`.
-        None assumes a camera at one of `sides` of the room, at the
-            given height or at all `CAMERA_HEIGHTS_M`, tilted by `gravity`; None is level.
+        mask: A PNG of ids, or COCO's JSON, which also has the classes.
+        pose: File for `read_pose`. None assumes a camera at one of `sides` of the room, at the
+            given height or at all `CAMERA_HEIGHTS_M`, tilted by `gravity` (level by default).
     """
     if mask.suffix.lower() == ".json":
         if classes is not None:

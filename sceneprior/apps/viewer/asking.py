@@ -25,9 +25,9 @@ class RequestFields:
     """Text fields of a request, and the drawing that fills two of them.
 
     Args:
-        asked: The initial request, as arguments of `Prior.sample`; parts without a text field stay
-        part of every request until Clear. safely: Runs a browser's task, and shows errors. drawn:
-        Called with the plan when a drawing begins, and with None when it ends.
+        asked: The initial request; parts without a text field stay in every request until Clear.
+        safely: Runs a browser's task, and shows errors.
+        drawn: Called with the plan when a drawing begins, and with None when it ends.
     """
 
     def __init__(

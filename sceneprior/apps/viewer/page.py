@@ -48,8 +48,8 @@ class Page:
 
     Args:
         models: CAD models for the choice `models` of `Furniture`; by default the package's own.
-        asked: Request of the first room, as arguments of `Prior.sample`. shell: Parts of the shell
-        (walls, floor) that are shown initially.
+        asked: Request of the first room, as arguments of `Prior.sample`.
+        shell: Parts of the shell (walls, floor) that are shown initially.
     """
 
     def __init__(
