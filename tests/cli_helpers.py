@@ -3,9 +3,11 @@
 from pathlib import Path
 from typing import Any
 
+from refusals import refused
 from typer.testing import CliRunner
 
 from sceneprior.apps.cli.commands import app
+from sceneprior.core.errors import InputError
 
 
 def call_here(runner: Any, arguments: list[str], log: Path) -> tuple[int, dict[str, float]]:
@@ -24,6 +26,13 @@ def one_sentence(result: tuple[int, str, str]) -> str:
     assert "Traceback" not in errors and lines[0].count("Error:") == 1
     assert lines[0][-1] in ".!" and len(lines[0]) > 40
     return lines[0]
+
+
+def refuses(command: Any, key: str, *arguments: object, **hidden: object) -> None:
+    """A command ends with one sentence, which is `key` of the golden file; see `refused`."""
+    said = one_sentence(command(*arguments)).removeprefix("Error: ")
+    with refused(key, **hidden):
+        raise InputError(said)
 
 
 def everything_in(folder: Path) -> dict[str, bytes]:
