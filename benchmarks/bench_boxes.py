@@ -16,7 +16,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from sceneprior.core.geometry.cameras import Boxes2D, boxes_of_points
+from sceneprior.core.cameras import Boxes2D, boxes_of_points
 from sceneprior.core.geometry.ellipsoids import boxes_of_ellipsoids
 from sceneprior.core.geometry.meshes import icosphere, place
 

@@ -34,7 +34,7 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from sceneprior.apps.config import load_config
-from sceneprior.core.geometry.cameras import MIN_DEPTH_M, Boxes2D, project
+from sceneprior.core.cameras import MIN_DEPTH_M, Boxes2D, project
 from sceneprior.core.geometry.meshes import icosphere, place
 from sceneprior.core.views import DecodedScenes, SceneViews
 from sceneprior.paper.config import PaperConfig

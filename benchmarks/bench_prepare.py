@@ -28,11 +28,11 @@ from typing import Any
 
 import numpy as np
 
+from sceneprior.core.cameras import Pinhole, look_at
 from sceneprior.core.errors import InputError
 from sceneprior.core.geometry.meshes import icosphere
 from sceneprior.core.scene import Mesh
-from sceneprior.render.offscreen import Pinhole, open_renderer
-from sceneprior.render.topdown import look_at
+from sceneprior.render.offscreen import open_renderer
 
 SIZE = (360, 480)
 PIECES, VIEWS = 12, 20

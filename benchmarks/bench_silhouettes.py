@@ -25,9 +25,9 @@ import numpy as np
 import torch
 from bench_boxes import boxes_ratio
 
+from sceneprior.core.cameras import look_at
 from sceneprior.core.geometry.meshes import icosphere
 from sceneprior.render.silhouettes import render_scene
-from sceneprior.render.topdown import look_at
 
 SIZE = (90, 120)
 OBJECTS, VIEWS = 13, 20

@@ -19,7 +19,7 @@ from bench_silhouettes import (
 from gpu_setup import Setup, peak_mib
 from torch import Tensor
 
-from sceneprior.core.geometry.cameras import project
+from sceneprior.core.cameras import project
 from sceneprior.render.silhouettes import render_scene
 from sceneprior.render.silhouettes.render import COMPOSITING, MODES
 

@@ -19,9 +19,9 @@ import torch
 
 from sceneprior.apps.config import load_config, load_run
 from sceneprior.apps.experiments.evaluate import decoded_and_true
+from sceneprior.core.cameras import boxes_of_points
 from sceneprior.core.data.datamodule import make_loader
 from sceneprior.core.data.dataset import ViewDataset
-from sceneprior.core.geometry.cameras import boxes_of_points
 from sceneprior.evaluation.metrics.decoded_rooms import reconstruction_scores
 from sceneprior.paper.losses.matching import match_objects
 from sceneprior.paper.trained import TrainedPrior

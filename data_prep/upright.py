@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sceneprior.core.cameras import camera_centers, nearest_to_rays, pixel_rays
 from sceneprior.core.geometry.corners import CUBE_CORNERS
 from sceneprior.core.shards import Sightings
 
@@ -109,20 +110,14 @@ def _starts(given: _Given) -> tuple[np.ndarray, np.ndarray]:
     A box is centred on the point nearest to the rays through the centres of the 2D boxes.
     """
     pixels = (given.boxes_px[..., :2] + given.boxes_px[..., 2:]) / 2
-    directions = np.concatenate([pixels, np.ones((*pixels.shape[:2], 1))], axis=2)
-    turns = given.poses[..., :3, :3].swapaxes(-1, -2)
-    rays = (turns @ np.linalg.solve(given.lenses, directions[..., None]))[..., 0]
+    rays = pixel_rays(pixels[..., None, :], given.poses, given.lenses)[..., 0, :]
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    eyes = -(turns @ given.poses[..., :3, 3:])[..., 0]
+    eyes = camera_centers(given.poses)
     both = given.chosen[:, :, None] & given.chosen[:, None]
     least = np.where(both, rays @ rays.swapaxes(1, 2), 1.0).min(axis=(1, 2), initial=1.0)
     told = (given.chosen.sum(axis=1) >= _VIEWS_AT_LEAST) & (least < np.cos(_PARALLAX_RAD))
     told &= given.clear.sum(axis=(1, 2)) >= _SIDES_AT_LEAST
-    across = (np.eye(3) - rays[..., :, None] * rays[..., None, :]) * given.chosen[..., None, None]
-    weak = 1e-6 * np.eye(3)
-    center = np.linalg.solve(across.sum(axis=1) + weak, (across @ eyes[..., None]).sum(axis=1))[
-        ..., 0
-    ]
+    center = nearest_to_rays(eyes, rays, 1e-6, used=given.chosen)
     depth = given.poses[..., 2, :3] @ center[..., None]
     depth = np.maximum(depth[..., 0] + given.poses[..., 2, 3], 10 * _NEAR_M)
     focal = given.lenses[..., [0, 1], [0, 1]]

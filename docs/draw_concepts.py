@@ -29,9 +29,9 @@ from data_prep.front.source import FrontSource
 from data_prep.homes.make import make_homes
 from data_prep.inspection.pictures import draw_view
 from sceneprior.apps.viewer.latent_map import make_map
+from sceneprior.core.cameras import project
 from sceneprior.core.classes import class_colors, label_set
 from sceneprior.core.data.dataset import FlatViews
-from sceneprior.core.geometry.cameras import project
 from sceneprior.core.geometry.meshes import icosphere, place
 from sceneprior.core.shards import RoomViews, Shard, thinned
 from sceneprior.core.views import SceneViews

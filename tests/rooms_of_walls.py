@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from sceneprior.core.cameras import Pinhole
 from sceneprior.core.classes import STUFF
 from sceneprior.core.instances.observations import observe
 from sceneprior.core.scene import Mesh
 from sceneprior.core.shards import RoomViews, stuff_size, stuff_step, thinned_intrinsics
-from sceneprior.render.offscreen import Pinhole, SoftwareRenderer
+from sceneprior.render.offscreen import SoftwareRenderer
 
 SIZE, HEIGHT_M = (180, 240), 2.5
 L_SHAPE = [(-2.0, -1.5), (2.0, -1.5), (2.0, 0.3), (0.5, 0.3), (0.5, 1.5), (-2.0, 1.5)]

@@ -10,6 +10,7 @@ from data_prep.front.furnished import Room
 from data_prep.front.recipe import Recipe, ViewRules
 from data_prep.front.rgb import soup
 from data_prep.front.viewpoints import Viewpoints, intrinsics, sees_enough
+from sceneprior.core.cameras import Pinhole
 from sceneprior.core.classes import STUFF, VOID, label_set
 from sceneprior.core.instances.observations import observe, pixel_counts
 from sceneprior.core.scene import Mesh
@@ -21,7 +22,7 @@ from sceneprior.core.shards import (
     thinned,
     thinned_intrinsics,
 )
-from sceneprior.render.offscreen import Pinhole, Renderer
+from sceneprior.render.offscreen import Renderer
 
 
 def prepare_room(

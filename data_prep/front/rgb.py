@@ -10,10 +10,11 @@ import numpy as np
 import shapely
 
 from data_prep.front.furnished import Room
+from sceneprior.core.cameras import Pinhole
 from sceneprior.core.classes import class_colors, label_set
 from sceneprior.core.scene import Mesh
 from sceneprior.core.shards import RoomViews
-from sceneprior.render.offscreen import Pinhole, Renderer
+from sceneprior.render.offscreen import Renderer
 from sceneprior.render.pictures import png_bytes
 
 FOLDER = "rgb"

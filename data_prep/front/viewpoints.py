@@ -8,7 +8,7 @@ import shapely
 
 from data_prep.front.furnished import Room
 from data_prep.front.recipe import ViewRules
-from sceneprior.render.offscreen import Pinhole
+from sceneprior.core.cameras import Pinhole, camera_at, to_camera
 
 _PLACES = 200  # random positions tried before a rule is relaxed
 _DARTS = 10_000  # random points tried before a point known to lie inside is taken
@@ -59,14 +59,12 @@ def camera_pose(eye_m: np.ndarray, yaw_rad: float, pitch_rad: float) -> np.ndarr
     """
     sin_yaw, cos_yaw = math.sin(yaw_rad), math.cos(yaw_rad)
     sin_pitch, cos_pitch = math.sin(pitch_rad), math.cos(pitch_rad)
-    world_to_camera = np.eye(4)
-    world_to_camera[:3, :3] = (
+    right_down_ahead = (
         (-cos_yaw, 0.0, sin_yaw),  # right
         (-sin_pitch * sin_yaw, -cos_pitch, -sin_pitch * cos_yaw),  # down
         (sin_yaw * cos_pitch, -sin_pitch, cos_yaw * cos_pitch),  # forward
     )
-    world_to_camera[:3, 3] = -world_to_camera[:3, :3] @ eye_m
-    return world_to_camera
+    return camera_at(np.array(right_down_ahead), eye_m)
 
 
 class Viewpoints:
@@ -145,7 +143,7 @@ class Viewpoints:
 
     def _in_view(self, camera: Pinhole) -> int:
         """Count the object centres inside the image: a cheap estimate of the visible objects."""
-        points = self._targets @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        points = to_camera(self._targets, camera.world_to_camera)
         height, width = self._rules.image_size
         limits = np.array([width / 2, height / 2]) / self._intrinsics[0, 0]
         return int((np.abs(points[:, :2]) < limits * points[:, 2:]).all(axis=1).sum())

@@ -8,6 +8,7 @@ from scipy.stats import rankdata
 from data_prep.inspection.causes import GIVEN, Cause, Convention, corrected
 from data_prep.inspection.triangulation import Middles, fit, middles
 from data_prep.posed.floor import find_floor
+from sceneprior.core.cameras import camera_centers
 from sceneprior.core.shards import RoomViews
 
 _LEAST_VIEWS = 5
@@ -61,7 +62,7 @@ def room_evidence(views: RoomViews, convention: Convention, floor: bool = True) 
     sums = dict(zip(cameras, agreement.sum(axis=1).tolist(), strict=True))
     poses, lenses = cameras[GIVEN]
     turns = poses[:, :3, :3]
-    eyes = -(turns.swapaxes(1, 2) @ poses[:, :3, 3:])[..., 0]
+    eyes = camera_centers(poses)
     level = find_floor(views, poses, lenses) if floor else None  # type: ignore[arg-type]
     shown = views.visible.sum(axis=0)
     x, y, z = (-turns[:, 1]).mean(axis=0).tolist()

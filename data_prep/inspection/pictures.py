@@ -7,7 +7,8 @@ import numpy as np
 import shapely
 from PIL import Image, ImageDraw, ImageFont
 
-from data_prep.inspection.projection import Segment, to_camera, wire_pixels
+from data_prep.inspection.projection import Segment, wire_pixels
+from sceneprior.core.cameras import camera_centers, to_camera
 from sceneprior.core.classes import class_colors, label_set
 from sceneprior.core.found_floor import find_floor
 from sceneprior.core.geometry.corners import BOX_EDGES, box_corners
@@ -118,7 +119,7 @@ def draw_plan(shard: Shard, room_id: str, width_px: int = 480, height_px: int = 
             for line in lines:
                 draw.line((*at(*line.start_m), *at(*line.end_m)), fill=color, width=4)
     for matrix in room.world_to_camera.astype(np.float64):
-        eye = -matrix[:3, :3].T @ matrix[:3, 3]
+        eye = camera_centers(matrix)
         u, v = at(eye[0], eye[2])
         draw.ellipse((u - 2, v - 2, u + 2, v + 2), fill=OUTLINE)
         ahead = eye + 0.3 * matrix[2, :3]
@@ -174,8 +175,7 @@ def _floor_bounds(room: RoomViews, truth: RoomGroundTruth | None) -> tuple[np.nd
         middle = truth.centers_m[:, (0, 2)]
         points = np.concatenate([truth.floor_m, middle - half, middle + half])
     if not len(points):
-        turn, place = room.world_to_camera[:, :3, :3], room.world_to_camera[:, :3, 3]
-        points = -np.einsum("tij,ti->tj", turn, place)[:, (0, 2)]
+        points = camera_centers(room.world_to_camera)[:, (0, 2)]
         points = np.concatenate([points - 1, points + 1])
     # The bounds are clipped, because a unit wrong by a factor of 1000 would need a million lines.
     return (

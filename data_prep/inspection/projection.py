@@ -7,18 +7,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
+from sceneprior.core.cameras import to_camera, to_pixels
 from sceneprior.core.geometry.corners import BOX_EDGES, box_corners
 
 WIRE_NEAR_M = 0.05
 """Depth of the near plane, at which lines are clipped."""
 
 Segment = tuple[float, float, float, float]
-
-
-def to_camera(points_m: np.ndarray, world_to_camera: np.ndarray) -> np.ndarray:
-    """Transform points, (P, 3), to a camera's axes (OpenCV), float64."""
-    matrix = np.asarray(world_to_camera, dtype=np.float64)
-    return np.asarray(points_m, dtype=np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def wire_pixels(
@@ -37,7 +32,7 @@ def wire_pixels(
         >>> wire_pixels(line, [(0, 1)], np.eye(4), np.diag([10.0, 10, 1]))
         [(14.0, 0.0, 1.0, 0.0)]
     """
-    camera = to_camera(points_m, world_to_camera)
+    camera = to_camera(*(np.asarray(part, np.float64) for part in (points_m, world_to_camera)))
     found = []
     for first, second in edges:
         a, b = camera[first], camera[second]
@@ -47,8 +42,8 @@ def wire_pixels(
             a = _cut(a, b)
         elif b[2] < WIRE_NEAR_M:
             b = _cut(b, a)
-        ends = (np.stack([a, b]) / [[a[2]], [b[2]]]) @ np.asarray(intrinsics, np.float64).T
-        u1, v1, u2, v2 = np.round(ends[:, :2], 6).ravel().tolist()
+        ends = to_pixels(np.stack([a, b]), np.asarray(intrinsics, np.float64))
+        u1, v1, u2, v2 = np.round(ends, 6).ravel().tolist()
         found.append((u1, v1, u2, v2))
     return found
 
@@ -86,10 +81,10 @@ def boxes_around(hull: Hull, world_to_camera: np.ndarray, intrinsics: np.ndarray
 
     (T, 4) x1, y1, x2, y2 in pixels, of the part beyond the near plane; NaN if there is none.
     """
-    poses = np.asarray(world_to_camera, dtype=np.float64)
-    camera = hull.points_m @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
+    poses, lenses = (np.asarray(part, np.float64) for part in (world_to_camera, intrinsics))
+    camera = to_camera(hull.points_m, poses)
     ahead = camera[..., 2] >= WIRE_NEAR_M
-    pixels = _pixels(np.where(ahead[..., None], camera, np.nan), intrinsics)
+    pixels = to_pixels(np.where(ahead[..., None], camera, np.nan), lenses)
     with warnings.catch_warnings():  # nanmin warns if the whole body is behind the camera
         warnings.simplefilter("ignore", RuntimeWarning)
         boxes = np.concatenate([np.nanmin(pixels, axis=1), np.nanmax(pixels, axis=1)], axis=1)
@@ -97,16 +92,10 @@ def boxes_around(hull: Hull, world_to_camera: np.ndarray, intrinsics: np.ndarray
         crossing = hull.edges[ahead[view, hull.edges].sum(axis=1) == 1]
         a, b = camera[view, crossing[:, 0]], camera[view, crossing[:, 1]]
         share = (WIRE_NEAR_M - a[:, 2:]) / (b[:, 2:] - a[:, 2:])
-        cut = _pixels((a + (b - a) * share)[None], intrinsics[view : view + 1])[0]
+        cut = to_pixels(a + (b - a) * share, lenses[view])
         boxes[view, :2] = np.minimum(boxes[view, :2], cut.min(axis=0))
         boxes[view, 2:] = np.maximum(boxes[view, 2:], cut.max(axis=0))
     return boxes
-
-
-def _pixels(camera: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-    """Project points in the cameras' axes, (T, P, 3), to pixels, (T, P, 2)."""
-    lenses = np.asarray(intrinsics, dtype=np.float64)
-    return ((camera / camera[..., 2:]) @ lenses.transpose(0, 2, 1))[..., :2]
 
 
 def box_iou_2d(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from data_prep.upright import own_sides
+from sceneprior.core.cameras import camera_centers
 from sceneprior.core.shards import RoomViews
 
 TOLERANCE, OF_BOX = 0.01, 0.15
@@ -124,7 +125,7 @@ def _unit_of_length(world_to_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray
     """Poses moved and scaled so that cameras stand about 2 m from the origin, their middle; and the
     unit of length, (h,)."""
     turns = world_to_camera[..., :3, :3]
-    eyes = -(turns.swapaxes(-1, -2) @ world_to_camera[..., :3, 3:])[..., 0]
+    eyes = camera_centers(world_to_camera)
     middle = eyes.mean(axis=1, keepdims=True)
     unit = np.sqrt(((eyes - middle) ** 2).sum(axis=-1).mean(axis=1)) / 2
     unit = np.maximum(unit, 1e-9)

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from data_prep.posed.tangents import Gaps, Outlines, find_outlines, measure_gaps
+from sceneprior.core.cameras import camera_at, camera_centers
 from sceneprior.core.classes import VOID
 from sceneprior.core.instances.observations import Observations, observe
 
@@ -107,16 +108,13 @@ def moved_cameras(
 ) -> Float[np.ndarray, "views 4 4"]:
     """Turn each camera about its centre by a rotation vector, then move it, along world axes."""
     rotations, centers_m = _changed(world_to_camera, change)
-    moved = np.tile(np.eye(4), (len(change), 1, 1))
-    moved[:, :3, :3] = rotations
-    moved[:, :3, 3] = -np.einsum("vij,vj->vi", rotations, centers_m)
-    return moved
+    return camera_at(rotations, centers_m)
 
 
 def _changed(poses: np.ndarray, change: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rotations and centres of cameras after a change."""
     turns = Rotation.from_rotvec(change[:, :3]).as_matrix()
-    centers_m = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
+    centers_m = camera_centers(poses)
     return poses[:, :3, :3] @ turns.transpose(0, 2, 1), centers_m + change[:, 3:]
 
 

@@ -9,8 +9,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from data_prep.posed.lens import Lens
+from sceneprior.core.cameras import odd_field_of_view
 from sceneprior.core.errors import InputError
-from sceneprior.core.geometry.intrinsics import odd_field_of_view
 from sceneprior.core.instances.checked import plain, shown
 
 INSTANCES = "instances"

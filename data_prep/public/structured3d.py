@@ -25,9 +25,9 @@ from data_prep.engine.source import RoomTask
 from data_prep.frames import Y_UP
 from data_prep.public.nyu40 import ids_and_classes
 from data_prep.public.rooms import FoundRoom, FramedRoom, Reader, chosen_frames, corners_of, sampled
+from sceneprior.core.cameras import odd_field_of_view
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
-from sceneprior.core.geometry.intrinsics import odd_field_of_view
 from sceneprior.core.instances.checked import checked, shown
 from sceneprior.core.instances.pngs import mask_size, read_mask
 

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from data_prep.tracks.voxels import MIN_DEPTH_M, Cameras
+from sceneprior.core.cameras import nearest_to_rays
 
 LEAST = 3
 """Minimum number of views whose masks show the same ball; two rays meet too often by chance."""
@@ -67,11 +68,7 @@ def balls_of(discs: Discs, pairs: Int[np.ndarray, "pairs 2"]) -> Balls:
 
     Its middle is nearest to both rays, and its radius is the mean of what both discs say.
     """
-    across = np.eye(3) - discs.rays[:, :, None] * discs.rays[:, None, :]
-    pull = np.einsum("dij,dj->di", across, discs.eyes_m)
-    # The small term keeps parallel rays solvable.
-    both = across[pairs].sum(axis=1) + 1e-9 * np.eye(3)
-    middles_m = np.linalg.solve(both, pull[pairs].sum(axis=1)[..., None])[..., 0]
+    middles_m = nearest_to_rays(discs.eyes_m[pairs], discs.rays[pairs], 1e-9)
     far_m = np.linalg.norm(middles_m[:, None] - discs.eyes_m[pairs], axis=2)
     return Balls(middles_m, (discs.radii[pairs] * np.maximum(far_m, MIN_DEPTH_M)).mean(axis=1))
 

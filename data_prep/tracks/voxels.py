@@ -10,6 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numba import njit
 
+from sceneprior.core.cameras import camera_centers
+
 BEYOND_M = 3.0
 """Maximum distance of objects from the cameras' bounding box."""
 COARSE_M, FINE = 0.32, 4
@@ -55,10 +57,8 @@ def cameras_of(
     sampled[:, :2] /= step
     sampled[:, :2, 2] += 0.5 - 0.5 / step
     poses = world_to_camera.astype(np.float64)
-    rotations = poses[:, :3, :3]
-    eyes = -np.einsum("vji,vj->vi", rotations, poses[:, :3, 3])
-    rays = rotations.swapaxes(1, 2) @ np.linalg.inv(sampled)
-    return Cameras(sampled @ poses[:, :3], eyes, rays, sampled[:, 0, 0].copy())
+    rays = poses[:, :3, :3].mT @ np.linalg.inv(sampled)
+    return Cameras(sampled @ poses[:, :3], camera_centers(poses), rays, sampled[:, 0, 0].copy())
 
 
 def fill(ids: Int[np.ndarray, "views height width"], cameras: Cameras) -> Grid:

@@ -11,6 +11,7 @@ import shapely
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
+from sceneprior.core.cameras import camera_centers, to_camera
 from sceneprior.core.shards import RoomViews, stuff_step, thinned_intrinsics
 from sceneprior.core.wall_lines import BARRIER, COARSE_M, FLOOR, Door, Wall, find_walls, on_floor
 
@@ -53,7 +54,7 @@ def find_floor(room: RoomViews) -> FoundFloor:
     walls, doors = find_walls(room)
     cells = _look_at_cells(room)
     seen = _polygon_of(cells, cells.seen)
-    eyes = -np.einsum("tij,ti->tj", room.world_to_camera[:, :3, :3], room.world_to_camera[:, :3, 3])
+    eyes = camera_centers(room.world_to_camera)
     return FoundFloor(seen, _between(walls, cells, seen, eyes[:, ::2]), walls, doors)
 
 
@@ -76,7 +77,7 @@ def _look_at_cells(room: RoomViews) -> _Cells:
     ground = np.insert(middles, 1, 0.0, axis=1)
     floor, wall = (np.zeros(len(ground), dtype=bool) for _ in range(2))
     for stuff, pose, K in views:
-        camera = ground @ pose[:3, :3].T + pose[:3, 3]
+        camera = to_camera(ground, pose)
         depth = np.maximum(camera[:, 2], 1e-6)
         u = np.floor(K[0, 0] * camera[:, 0] / depth + K[0, 2])
         v = np.floor(K[1, 1] * camera[:, 1] / depth + K[1, 2])

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Float32, Int64, Integer
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
+from sceneprior.core.cameras import camera_centers
 from sceneprior.core.errors import InputError
 from sceneprior.core.shards import RoomViews, iterate_rooms, thinned
 from sceneprior.core.views import SceneViews
@@ -37,7 +38,7 @@ class ObservedImage:
     @property
     def eye_m(self) -> Float[np.ndarray, "3"]:
         """Camera centre in the room frame."""
-        return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
+        return camera_centers(self.world_to_camera)
 
     def sampled_ids(self, step: int) -> Integer[np.ndarray, "rows columns"]:
         """Instance ids downsampled by `step`, as in training (`thinned`)."""

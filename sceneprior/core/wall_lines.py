@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from sceneprior.core.cameras import camera_centers, pixel_rays
 from sceneprior.core.classes import STUFF
 from sceneprior.core.shards import RoomViews, stuff_step, thinned_intrinsics
 
@@ -150,11 +151,9 @@ def on_floor(
 ]:
     """Points (x, z) at which the rays through pixels meet y = 0, the length in metres along the ray
     that one pixel covers there (inf above the horizon), and unit vectors to below the camera."""
-    turn = world_to_camera[:3, :3]
-    eye = -turn.T @ world_to_camera[:3, 3]
+    eye = camera_centers(world_to_camera)
     focal = intrinsics[[0, 1], [0, 1]]
-    across = (pixels - intrinsics[:2, 2]) / focal
-    rays = np.concatenate([across, np.ones((len(across), 1))], axis=1) @ turn
+    rays = pixel_rays(pixels, world_to_camera, intrinsics)
     down = np.maximum(-rays[:, 1], 1e-9)
     reach = rays[:, ::2] * (eye[1] / down)[:, None]
     distance = np.linalg.norm(reach, axis=1)

@@ -6,7 +6,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
-from sceneprior.core.geometry.cameras import Boxes2D, boxes_of_points
+from sceneprior.core.cameras import Boxes2D, boxes_of_points
 from sceneprior.core.geometry.ellipsoids import boxes_of_ellipsoids
 from sceneprior.core.geometry.meshes import beveled_cube, place
 from sceneprior.core.views import DecodedScenes, SceneViews

@@ -7,8 +7,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
+from sceneprior.core.cameras import Orthographic
 from sceneprior.core.scene import Scene
-from sceneprior.render.offscreen import Orthographic, SoftwareRenderer
+from sceneprior.render.offscreen import SoftwareRenderer
 from sceneprior.render.pictures import paint_ids
 from sceneprior.render.topdown import BACKGROUND, FLOOR_COLOR, object_colors, scene_meshes
 

@@ -4,15 +4,16 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
+from sceneprior.core.cameras import Orthographic, Pinhole, look_at
 from sceneprior.core.classes import class_colors, label_set
 from sceneprior.core.floor import floor_rectangle
 from sceneprior.core.geometry.corners import BOX_FACES, box_corners
 from sceneprior.core.palette import quiet_colors
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.core.shell import ShellName, rectangle, shell_of, slab
-from sceneprior.render.offscreen import Orthographic, Pinhole, SoftwareRenderer
+from sceneprior.render.offscreen import SoftwareRenderer
 from sceneprior.render.pictures import paint_ids
 
 BACKGROUND = (255, 255, 255)
@@ -120,22 +121,6 @@ def topdown(
         return paint_ids(ids, object_colors(scene), protocol.background)
     colors = class_colors(len(label_set(scene.label_set)))[scene.class_indices]
     return np.concatenate([[protocol.background], colors]).astype(np.uint8)[ids]
-
-
-def look_at(
-    eye_m: Float[np.ndarray, "3"], target_m: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "4 4"]:
-    """`world_to_camera` of a camera at `eye_m` that looks at `target_m`, with y up.
-
-    The viewing direction must not be vertical.
-    """
-    forward = target_m - eye_m
-    right = np.cross(forward, [0.0, 1.0, 0.0])
-    forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, -rotation @ eye_m
-    return matrix
 
 
 @dataclass(frozen=True)

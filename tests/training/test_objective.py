@@ -9,7 +9,7 @@ from tiny_runs import tiny_config
 from torch.testing import assert_close
 from toy_rooms import look_at
 
-from sceneprior.core.geometry.cameras import boxes_of_points
+from sceneprior.core.cameras import boxes_of_points
 from sceneprior.core.views import DecodedScenes, SceneViews
 from sceneprior.paper.settings import ShapeConfig
 from sceneprior.paper.view_loss import proxy_boxes, seen_boxes

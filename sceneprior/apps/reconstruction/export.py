@@ -10,6 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from sceneprior.apps.reconstruction.reconstruct import Reconstruction
 from sceneprior.apps.rooms import PAGE_FILE, clear_scenes, write_scene
+from sceneprior.core.cameras import Pinhole
 from sceneprior.core.classes import label_set
 from sceneprior.core.files import write_whole
 from sceneprior.core.observed_image import ObservedImage
@@ -17,7 +18,7 @@ from sceneprior.core.palette import quiet_colors
 from sceneprior.core.scene import Scene
 from sceneprior.evaluation.page import png_uri
 from sceneprior.evaluation.rooms_page import write_rooms_page
-from sceneprior.render.offscreen import Pinhole, SoftwareRenderer
+from sceneprior.render.offscreen import SoftwareRenderer
 from sceneprior.render.pictures import paint_ids, png_bytes
 from sceneprior.render.topdown import (
     object_colors,

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sceneprior.core.cameras import camera_at, camera_centers, odd_field_of_view
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
-from sceneprior.core.geometry.intrinsics import odd_field_of_view
 from sceneprior.core.geometry.turns import QUARTERS, quarter_rotation
 from sceneprior.core.instances.checked import number_array
 from sceneprior.core.instances.coco import read_coco
@@ -169,10 +169,7 @@ def level_camera(height_m: float, quarter: int = 0) -> np.ndarray:
     """
     turn = quarter_rotation(quarter)
     eye = turn @ np.array([0, height_m, CAMERA_DISTANCE_M])
-    pose = np.eye(4)
-    pose[:3, :3] = np.diag([1.0, -1.0, -1.0]) @ turn.T  # OpenCV: y down, z into the room
-    pose[:3, 3] = -pose[:3, :3] @ eye
-    return pose
+    return camera_at(np.diag([1.0, -1.0, -1.0]) @ turn.T, eye)  # OpenCV: y down, z into the room
 
 
 def read_gravity(text: str) -> np.ndarray:
@@ -323,7 +320,7 @@ def read_pose(path: Path) -> np.ndarray:
             "Expected camera axes x right, y down, z forward (OpenCV; Blender's and OpenGL's have "
             "y up and look along -z), and a room with y up."
         )
-    eye_m = -pose[:3, :3].T @ pose[:3, 3]
+    eye_m = camera_centers(pose)
     if eye_m[1] <= 0:
         raise InputError(
             f"The camera of {path} is {-eye_m[1]:g} m below the floor, which is y = 0; move it, or "

@@ -11,8 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
+from sceneprior.core.cameras import camera_centers
 from sceneprior.core.classes import VOID
-from sceneprior.core.geometry.cameras import camera_centers
 from sceneprior.core.views import DecodedScenes, SceneViews
 
 VARIED = (1.5, 1.5, 0.3, 0.3, 0.3)

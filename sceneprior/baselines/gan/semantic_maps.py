@@ -5,8 +5,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
+from sceneprior.core.cameras import project
 from sceneprior.core.classes import VOID
-from sceneprior.core.geometry.cameras import project
 from sceneprior.core.views import DecodedScenes, SceneViews
 from sceneprior.render.silhouettes.render import render_scene
 

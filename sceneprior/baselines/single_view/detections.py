@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from sceneprior.core.geometry.cameras import camera_centers
+from sceneprior.core.cameras import camera_centers
 from sceneprior.core.geometry.turns import QUARTERS, turn_vectors
 from sceneprior.core.views import SceneViews
 

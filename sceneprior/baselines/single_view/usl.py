@@ -23,7 +23,7 @@ from sceneprior.baselines.single_view.network import (
     last_layer,
     meshes_of,
 )
-from sceneprior.core.geometry.cameras import boxes_of_points
+from sceneprior.core.cameras import boxes_of_points
 from sceneprior.core.scene import Mesh
 from sceneprior.core.views import SceneViews
 from sceneprior.paper.losses.averages import mean_of_objects

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sceneprior.core.geometry.cameras import MIN_DEPTH_M, Boxes2D
+from sceneprior.core.cameras import MIN_DEPTH_M, Boxes2D
 
 SERIAL_NUMEL = 32768
 """Number of elements up to which torch runs an operation on one thread. Tensors are split into

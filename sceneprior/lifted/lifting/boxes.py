@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Bool, Float, Int, Real
 
+from sceneprior.core.cameras import camera_centers, nearest_to_rays, pixel_rays
 from sceneprior.core.shards import RoomViews
 from sceneprior.lifted.lifting.hulls import MOST_EMPTY, Sightings, carve, cells_along, sightings_of
 from sceneprior.lifted.lifting.lifted import LiftedBoxes
@@ -125,7 +126,7 @@ def own_rays(
         picked = np.concatenate([rng.integers(len(u), size=each), outermost])
         rays = pixel_directions(u[picked], v[picked], pose, camera)
         directions.append(rays)
-        origins.append(np.broadcast_to(-pose[:3, :3].T @ pose[:3, 3], rays.shape))
+        origins.append(np.broadcast_to(camera_centers(pose), rays.shape))
     return np.concatenate(origins).astype(np.float64), np.concatenate(directions)
 
 
@@ -136,9 +137,7 @@ def pixel_directions(
     intrinsics: Float[np.ndarray, "3 3"],
 ) -> Float[np.ndarray, "rays 3"]:
     """Unit directions, in the room frame, of rays through the centres of pixels."""
-    x = (u + 0.5 - intrinsics[0, 2]) / intrinsics[0, 0]
-    y = (v + 0.5 - intrinsics[1, 2]) / intrinsics[1, 1]
-    rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ world_to_camera[:3, :3].astype(np.float64)
+    rays = pixel_rays(np.stack([u, v], axis=-1) + 0.5, world_to_camera, intrinsics)
     return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
 
@@ -151,20 +150,15 @@ def _where_to_look(
     boxes_px = views.boxes[rows, item] * np.array([width, height, width, height])
     poses, intrinsics = views.world_to_camera[rows], views.intrinsics[rows]
     middle_px = (boxes_px[:, :2] + boxes_px[:, 2:]) / 2 - 0.5
-    cameras_m = -(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0]
+    cameras_m = camera_centers(poses)
     rays = np.concatenate(
         [
             pixel_directions(pixel[:1], pixel[1:], pose, camera)
             for pixel, pose, camera in zip(middle_px, poses, intrinsics, strict=True)
         ]
     )
-    across = np.eye(3) - rays[:, :, None] * rays[:, None]
-    weak = 1e-3
     guess_m = (cameras_m + UNKNOWN_DISTANCE_M * rays).mean(axis=0)
-    middle_m = np.linalg.solve(
-        across.sum(axis=0) + weak * np.eye(3),
-        (across @ cameras_m[..., None]).sum(axis=0)[:, 0] + weak * guess_m,
-    )
+    middle_m = nearest_to_rays(cameras_m, rays, 1e-3, guess_m)
     spans = (boxes_px[:, 2:] - boxes_px[:, :2]) / intrinsics[:, [0, 1], [0, 1]]
     distances_m = np.linalg.norm(middle_m - cameras_m, axis=-1)
     radius_m = 1.3 * float((np.linalg.norm(spans, axis=-1) / 2 * distances_m).max()) + 0.15

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Int
 from numba import njit
 
+from sceneprior.core.cameras import camera_centers
 from sceneprior.core.shards import RoomViews
 from sceneprior.lifted.lifting.boxes import pixel_directions
 from sceneprior.lifted.lifting.hulls import own_in, pass_through, sightings_of
@@ -68,8 +69,7 @@ def _draw(
     for row, (pose, camera) in enumerate(zip(poses, intrinsics, strict=True)):
         mine = view == row
         directions[mine] = pixel_directions(u[mine], v[mine], pose, camera)
-    cameras_m = -(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0]
-    origins_m = cameras_m[view].astype(np.float64)
+    origins_m = camera_centers(poses)[view].astype(np.float64)
     until_m = np.where((ids == 0) | (ids == item + 1), FAR_M, 0.0)
     # Indexed by id: True for other objects with a known box. Id 0 is background, the last id void.
     has_box = np.concatenate([[False], boxes.explained > 0, [False]])

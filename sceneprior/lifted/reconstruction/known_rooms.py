@@ -16,9 +16,9 @@ from torch import Tensor
 from torch.nn import functional as F
 from torch.nn.utils.rnn import pad_sequence
 
+from sceneprior.core.cameras import Pinhole, boxes_of_points
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.geometry.cameras import boxes_of_points
 from sceneprior.core.geometry.corners import box_corners
 from sceneprior.core.geometry.turns import QUARTERS, quarter_rotation
 from sceneprior.core.ground_truth import reference_scene
@@ -27,7 +27,7 @@ from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.core.shards import Shard, iterate_rooms
 from sceneprior.core.views import DecodedScenes
 from sceneprior.paper.losses.matching import match_objects, matching_cost
-from sceneprior.render.offscreen import Pinhole, Renderer
+from sceneprior.render.offscreen import Renderer
 from sceneprior.render.topdown import scene_meshes
 
 BOX_WEIGHT, OCCLUSION_SLACK = 5.0, 0.15

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sceneprior.core.geometry.cameras import camera_centers, pixel_rays
+from sceneprior.core.cameras import camera_centers, pixel_rays
 from sceneprior.lifted.reconstruction.outlines import Outlines, beyond, projected_extents
 
 STEPS = 12

@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
-from sceneprior.core.geometry.cameras import Boxes2D, camera_centers, pixel_rays
+from sceneprior.core.cameras import Boxes2D, camera_centers, pixel_rays
 from sceneprior.core.views import DecodedScenes, LiftedRooms, SceneViews
 from sceneprior.paper.losses.averages import mean_of_objects, share_of_batch
 from sceneprior.paper.losses.completeness import completeness_targets

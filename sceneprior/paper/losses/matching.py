@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from sceneprior.core.geometry.cameras import Boxes2D
+from sceneprior.core.cameras import Boxes2D
 from sceneprior.core.views import DecodedScenes, SceneViews
 
 

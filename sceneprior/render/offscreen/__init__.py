@@ -9,11 +9,10 @@ import os
 import sys
 
 from sceneprior.core.errors import InputError
-from sceneprior.render.offscreen.cameras import Camera, Orthographic, Pinhole
 from sceneprior.render.offscreen.gl import NoGLError, open_pyrender
 from sceneprior.render.offscreen.renderer import Renderer, SoftwareRenderer
 
-__all__ = ["Camera", "Orthographic", "Pinhole", "Renderer", "SoftwareRenderer", "open_renderer"]
+__all__ = ["Renderer", "SoftwareRenderer", "open_renderer"]
 
 KINDS = ("auto", "pyrender", "software")
 ENVIRONMENT_VARIABLE = "SCENEPRIOR_RENDERER"

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from sceneprior.core.cameras import Camera, Pinhole
 from sceneprior.core.scene import Mesh
-from sceneprior.render.offscreen.cameras import Camera, Pinhole
 from sceneprior.render.offscreen.gl_ids import id_renderer_class
 from sceneprior.render.offscreen.renderer import Renderer
 

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sceneprior.core.cameras import Camera, Pinhole, to_camera
 from sceneprior.core.scene import Mesh
-from sceneprior.render.offscreen.cameras import Camera, Pinhole
 from sceneprior.render.offscreen.sky import sky_light
 
 EVEN = 0.2
@@ -143,8 +143,8 @@ def _draw(
 
 def _face_light(soup: _Soup, camera: Camera) -> np.ndarray:
     """Brightness of each face in [0.4, 1]: ambient light, and a lamp slightly above the camera."""
-    to_camera = np.asarray(camera.world_to_camera, dtype=np.float64)
-    corners = (soup.vertices @ to_camera[:3, :3].T + to_camera[:3, 3])[soup.faces]
+    world_to_camera = np.asarray(camera.world_to_camera, dtype=np.float64)
+    corners = to_camera(soup.vertices, world_to_camera)[soup.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     if isinstance(camera, Pinhole):

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numba import njit
 
-from sceneprior.render.offscreen.cameras import Pinhole
+from sceneprior.core.cameras import Pinhole
 
 DIRECTIONS = 128
 """Number of directions towards the sky in which light is tested for occlusion. With 24, the floor

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from sceneprior.core.geometry.cameras import project
+from sceneprior.core.cameras import project
 from sceneprior.render.silhouettes.reference import Settings
 
 NEAR_FACE_M = 0.05

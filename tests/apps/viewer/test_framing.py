@@ -12,9 +12,9 @@ from sceneprior.apps.viewer.framing import (
     framed,
     room_bounds,
 )
+from sceneprior.core.cameras import look_at
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.shell import shell_of
-from sceneprior.render.topdown import look_at
 
 
 @pytest.mark.parametrize("forward", [CORNER, FRONT, DOWN])

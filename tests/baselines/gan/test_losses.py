@@ -17,8 +17,8 @@ from sceneprior.baselines.gan.losses import (
     contents,
     diversity_loss,
 )
+from sceneprior.core.cameras import camera_centers
 from sceneprior.core.data.dataset import ViewDataset
-from sceneprior.core.geometry.cameras import camera_centers
 from sceneprior.core.views import DecodedScenes
 
 

@@ -7,10 +7,10 @@ from references.batches import batch_room_by_room, rooms_with_images, turn_about
 from torch.testing import assert_close
 from toy_rooms import make_toy_room, write_shard
 
+from sceneprior.core.cameras import boxes_of_points
 from sceneprior.core.data.datamodule import DrawSampler, make_loader
 from sceneprior.core.data.dataset import BLANK, ViewDataset
 from sceneprior.core.errors import ShardError
-from sceneprior.core.geometry.cameras import boxes_of_points
 from sceneprior.core.geometry.corners import box_corners
 from sceneprior.core.shards import RoomViews, Shard, list_shards
 

@@ -7,7 +7,7 @@ import torch
 from references.ellipsoids import box_of_cloud, boxes_of_quadrics
 from torch.testing import assert_close
 
-from sceneprior.core.geometry.cameras import MIN_DEPTH_M
+from sceneprior.core.cameras import MIN_DEPTH_M
 from sceneprior.core.geometry.ellipsoids import boxes_of_ellipsoids
 
 SIZE = (60, 80)

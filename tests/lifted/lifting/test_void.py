@@ -7,6 +7,7 @@ import pytest
 import trimesh
 from toy_rooms import look_at
 
+from sceneprior.core.cameras import Pinhole
 from sceneprior.core.classes import VOID
 from sceneprior.core.instances.observations import observe
 from sceneprior.core.parts import filled_cells
@@ -16,7 +17,7 @@ from sceneprior.lifted.lifting.lifted import RayPool, ShapeGrid
 from sceneprior.lifted.lifting.part_fit import fit_parts
 from sceneprior.lifted.lifting.rays import draw_rays
 from sceneprior.lifted.lifting.shapes import lift_shapes
-from sceneprior.render.offscreen import Pinhole, SoftwareRenderer
+from sceneprior.render.offscreen import SoftwareRenderer
 
 GRID = ShapeGrid(cells=24, margin=1.15)
 BED_M = np.array([1.6, 0.6, 2.0])

@@ -7,7 +7,7 @@ import pytest
 import torch
 from toy_rooms import look_at
 
-from sceneprior.core.geometry.cameras import Boxes2D, boxes_of_points
+from sceneprior.core.cameras import Boxes2D, boxes_of_points
 from sceneprior.core.geometry.corners import box_corners
 from sceneprior.core.views import DecodedScenes, SceneViews
 

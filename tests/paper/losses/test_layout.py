@@ -6,7 +6,7 @@ import pytest
 import torch
 from references import losses as by_hand
 
-from sceneprior.core.geometry.cameras import boxes_of_points
+from sceneprior.core.cameras import boxes_of_points
 from sceneprior.core.geometry.corners import box_corners
 from sceneprior.paper.losses.layout import (
     box_loss,

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from sceneprior.core.geometry.cameras import Boxes2D
+from sceneprior.core.cameras import Boxes2D
 from sceneprior.paper.losses.averages import mean_of_objects
 from sceneprior.paper.losses.layout import layout_losses
 from sceneprior.paper.losses.matching import Matches, match_objects

@@ -7,10 +7,11 @@ import sys
 import numpy as np
 import pytest
 
+from sceneprior.core.cameras import Orthographic, Pinhole
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Mesh
 from sceneprior.render import offscreen
-from sceneprior.render.offscreen import Orthographic, Pinhole, gl, open_renderer
+from sceneprior.render.offscreen import gl, open_renderer
 
 INTRINSICS = np.array([[100.0, 0, 64], [0, 100, 48], [0, 0, 1]])
 SIZE = (96, 128)
@@ -178,7 +179,8 @@ def test_one_pyrender_a_process_and_none_after_a_fork():
     assert open_renderer("pyrender") is one
     code = (
         "import os, numpy as np\n"
-        "from sceneprior.render.offscreen import open_renderer, Pinhole\n"
+        "from sceneprior.core.cameras import Pinhole\n"
+        "from sceneprior.render.offscreen import open_renderer\n"
         "r = open_renderer('pyrender')\n"
         "if os.fork() == 0:\n"
         "    try:\n"

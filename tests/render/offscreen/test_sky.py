@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from sceneprior.core.cameras import Pinhole, look_at
 from sceneprior.core.scene import Mesh, Scene, SceneObject
-from sceneprior.render.offscreen.cameras import Pinhole
 from sceneprior.render.offscreen.sky import DARKEST, sky_light
 from sceneprior.render.offscreen.zbuffer import rasterize
-from sceneprior.render.topdown import box_mesh, look_at, perspective
+from sceneprior.render.topdown import box_mesh, perspective
 
 SIZE = (60, 80)
 CAMERA = Pinhole(

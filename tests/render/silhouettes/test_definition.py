@@ -9,7 +9,7 @@ from references.silhouettes import composite_loop, exact_loop
 from silhouette_scenes import COMPOSITING, MODES, SIZE, random_scene, triangles
 from toy_rooms import look_at
 
-from sceneprior.core.geometry.cameras import project
+from sceneprior.core.cameras import project
 from sceneprior.render.silhouettes import reference
 from sceneprior.render.silhouettes.render import NEAR_FACE_M, render_silhouettes
 

@@ -1,4 +1,4 @@
-"""Compiled `core.geometry.cameras.project` for the CPU backend, and its gradient.
+"""Compiled `core.cameras.project` for the CPU backend, and its gradient.
 
 In torch, the dozen small operations of `project` would take as long as the drawing itself.
 """
@@ -10,7 +10,7 @@ from numba import njit
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sceneprior.core.geometry.cameras import MIN_DEPTH_M
+from sceneprior.core.cameras import MIN_DEPTH_M
 from sceneprior.render.silhouettes.cpu.threads import in_threads
 
 

@@ -12,7 +12,7 @@ from references.silhouettes import junctions, shape_coverage, shape_of
 from silhouette_scenes import seen_ahead, triangles
 from torch import Tensor
 
-from sceneprior.core.geometry.cameras import project
+from sceneprior.core.cameras import project
 from sceneprior.core.geometry.meshes import icosphere
 from sceneprior.render.silhouettes.reference import PIECE_PX
 from sceneprior.render.silhouettes.render import render_silhouettes

@@ -8,7 +8,7 @@ import torch
 from torch.testing import assert_close
 from toy_rooms import look_at
 
-from sceneprior.core.geometry.cameras import (
+from sceneprior.core.cameras import (
     MIN_DEPTH_M,
     boxes_of_points,
     camera_centers,
