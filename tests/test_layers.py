@@ -42,9 +42,9 @@ MAY_TOO = {
 
 BUDGET = {
     "data_prep": (13743, 110),
-    "sceneprior/core": (5987, 49),
+    "sceneprior/core": (6150, 49),
     "sceneprior/furniture": (586, 4),
-    "sceneprior/render": (4552, 36),
+    "sceneprior/render": (4552, 35),
     "sceneprior/training": (859, 8),
     "sceneprior/paper": (2710, 24),
     "sceneprior/lifted": (8874, 68),
