@@ -1,13 +1,10 @@
 """The fields of the panel in which a user requests a room: floor, doors and windows, wishes."""
 
-import contextlib
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sceneprior.apps.viewer.drawing import HINT, Drawing
-from sceneprior.apps.viewer.plan import Plan, plan_of
 from sceneprior.apps.viewer.words import html
 from sceneprior.core.errors import InputError
 from sceneprior.lifted.requests.openings import read_openings
@@ -22,12 +19,11 @@ _WANT = "a double bed and two nightstands beside it; or numbers: nightstand: 2, 
 
 
 class RequestFields:
-    """Text fields of a request, and the drawing that fills two of them.
+    """Text fields of a request.
 
     Args:
         asked: The initial request; parts without a text field stay in every request until Clear.
         safely: Runs a browser's task, and shows errors.
-        drawn: Called with the plan when a drawing begins, and with None when it ends.
     """
 
     def __init__(
@@ -35,26 +31,16 @@ class RequestFields:
         server: "viser.ViserServer",
         asked: Mapping[str, Any],
         safely: Callable[[Callable[[], None]], None],
-        drawn: Callable[[Plan | None], None],
     ):
         gui = server.gui
-        self._safely, self._drawn = safely, drawn
-        self.drawing, self._filling = Drawing(server, self._filled), False
         texts, self._rest = _texts_of(asked)
         self.floor: Any = gui.add_text("Floor", texts["floor"], hint=_FLOOR)
         self.openings: Any = gui.add_text("Doors", texts["openings"], hint=_OPENINGS)
         self.want: Any = gui.add_text("Wishes", texts["want"], multiline=True, hint=_WANT)
         self.ceiling: Any = gui.add_text("Ceiling", texts["ceiling_m"], hint="Height in metres")
         self._rest_said = gui.add_html("", visible=False)
-        self._kind: Any = gui.add_dropdown("Click puts", ("door", "window"), visible=False)
-        self._hint = gui.add_html(html(HINT), visible=False)
-        self._draw: Any = gui.add_button("Draw floor and doors", color="gray")
         self._clear: Any = gui.add_button("Clear the request", color="gray")
-        self._draw.on_click(lambda _: safely(self._draw_or_end))
         self._clear.on_click(lambda _: safely(self._emptied))
-        for field in (self.floor, self.openings):
-            field.on_update(lambda _: self._typed())
-        self._kind.on_update(lambda _: self._chosen())
         self._say_rest()
 
     def asked(self) -> dict[str, Any]:
@@ -81,53 +67,11 @@ class RequestFields:
                 ) from None
         return asked
 
-    def end_drawing(self) -> None:
-        """End the drawing; the floor's middle becomes the origin, as in requested rooms."""
-        if (plan := self.drawing.plan) is not None:
-            self.drawing.show(None)
-            self._filled(plan.centred())
-            self._show_drawing(False)
-            self._drawn(None)
-
-    def _draw_or_end(self) -> None:
-        if self.drawing.plan is not None:
-            self.end_drawing()
-            return
-        plan = plan_of(self.floor.value, self.openings.value)
-        self.drawing.show(plan)
-        self._filled(plan)
-        self._show_drawing(True)
-        self._drawn(plan)
-
-    def _show_drawing(self, drawing: bool) -> None:
-        self._kind.visible = self._hint.visible = drawing
-        self._draw.label = "End the drawing" if drawing else "Draw floor and doors"
-
-    def _chosen(self) -> None:
-        self.drawing.kind = self._kind.value
-
-    def _filled(self, plan: Plan) -> None:
-        """Write a plan's texts into the fields."""
-        self._filling = True  # setting a field fires its event before the other field is set
-        self.floor.value, self.openings.value = plan.floor_text(), plan.openings_text()
-        self._filling = False
-
-    def _typed(self) -> None:
-        """Redraw the plan from the fields, unless the drawing itself filled them."""
-        if self.drawing.plan is None or self._filling:
-            return
-        # Half-typed text may not be a plan; a request reports the error later.
-        with contextlib.suppress(InputError):
-            self.drawing.show(plan_of(self.floor.value, self.openings.value))
-
     def _emptied(self) -> None:
-        self.drawing.show(None)
-        self._show_drawing(False)
         for field in (self.floor, self.openings, self.want, self.ceiling):
             field.value = ""
         self._rest = {}
         self._say_rest()
-        self._drawn(None)
 
     def _say_rest(self) -> None:
         """Show the names of request parts without a text field."""
@@ -146,8 +90,8 @@ def _texts_of(asked: Mapping[str, Any]) -> tuple[dict[str, str], dict[str, Any]]
         elif key in texts and isinstance(value, str):
             texts[key] = value
         elif key == "floor":
-            outline = np.asarray(value).tolist()
-            texts[key] = Plan(tuple((float(x), float(z)) for x, z in outline)).floor_text()
+            corners = np.asarray(value).tolist()
+            texts[key] = " ".join(f"{round(x, 3):g},{round(z, 3):g}" for x, z in corners)
         elif key == "openings" and all(isinstance(each, str) for each in value):
             texts[key] = ", ".join(value)
         else:

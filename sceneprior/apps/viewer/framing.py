@@ -15,8 +15,6 @@ CORNER = np.array([-0.42, -0.62, -0.66])
 """Viewing direction if only a room is shown, as in the pictures of rooms."""
 FRONT = np.array([0.0, -0.6, -0.8])
 """Viewing direction if a room is shown beside the map, which faces the camera."""
-DOWN = np.array([0.0, -1.0, -0.01])
-"""Viewing direction onto a plan; exactly downwards would leave the up direction undefined."""
 MARGIN = 0.92
 """Share of the window that the points may fill."""
 

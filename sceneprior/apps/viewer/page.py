@@ -17,7 +17,6 @@ from sceneprior.apps.viewer.explorer import NOTHING_ASKED, Explorer, Folder, Sho
 from sceneprior.apps.viewer.framing import (
     ASPECT,
     CORNER,
-    DOWN,
     FOV_RAD,
     FRONT,
     box_points,
@@ -27,7 +26,6 @@ from sceneprior.apps.viewer.framing import (
 )
 from sceneprior.apps.viewer.nodes import RoomNodes
 from sceneprior.apps.viewer.panel import MODELS, Panel
-from sceneprior.apps.viewer.plan import Plan
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene
 from sceneprior.core.shell import ShellName, shell_of
@@ -37,8 +35,6 @@ if TYPE_CHECKING:
 
 GAP = 0.06
 """Gap between the room and its neighbours, relative to the width of the room's floor."""
-AROUND_PLAN_M = 1.0
-"""Width of the floor shown around a plan that is being drawn."""
 SMALL = 0.55
 """The cameras are framed again if the room's sides fall below this share of the framed box's."""
 
@@ -115,18 +111,6 @@ class Page:
             if settled and self._is_framed_badly():
                 self.frame()
 
-    def draw(self, plan: Plan | None) -> None:
-        """Show a plan to draw on, from above, in place of the room; None shows the room again."""
-        self._room.frame.visible = plan is None
-        if self.board is not None:
-            self.board.frame.visible = plan is None
-        if plan is None:
-            self._beside.frame.visible = self.panel.nearest is not None and self.panel.nearest.value
-            self.frame(True)
-        else:
-            self._beside.frame.visible = False
-            self._look(self._plan_points(plan), DOWN)
-
     # -- Cameras -----------------------------------------------------------------------------------
 
     def frame(self, turned: bool = False) -> None:
@@ -136,20 +120,16 @@ class Page:
             turned: Use the page's viewing direction instead of each camera's current one.
         """
         self._bounds_m = self._room_bounds()
-        self._look(self._points(), self._direction if turned else None)
-
-    @property
-    def _direction(self) -> Float[np.ndarray, "3"]:
-        return CORNER if self.board is None else FRONT
-
-    def _look(
-        self, points_m: Float[np.ndarray, "points 3"], forward: Float[np.ndarray, "3"] | None
-    ) -> None:
+        points_m = self._points()
         eye, target = framed(points_m, self._direction, FOV_RAD, ASPECT)
         self.server.initial_camera.position = eye
         self.server.initial_camera.look_at = target
         for client in self.server.get_clients().values():
-            self._place(client, points_m, forward)
+            self._place(client, points_m, self._direction if turned else None)
+
+    @property
+    def _direction(self) -> Float[np.ndarray, "3"]:
+        return CORNER if self.board is None else FRONT
 
     def _place(
         self,
@@ -177,9 +157,7 @@ class Page:
             reshaped = abs(camera.aspect - aspect) > 0.01
             aspect = camera.aspect
             if own is None or (reshaped and np.allclose(camera.position, own, atol=0.02)):
-                plan = self.panel.plan
-                points_m = self._points() if plan is None else self._plan_points(plan)
-                self._place(client, points_m, DOWN if plan is not None else self._direction)
+                self._place(client, self._points(), self._direction)
 
         update(client.camera)
         client.camera.on_update(update)
@@ -197,11 +175,6 @@ class Page:
                       for y in (0.0, 2.0)]  # fmt: skip
             points.append(np.array(beside))
         return np.concatenate(points)
-
-    def _plan_points(self, plan: Plan) -> Float[np.ndarray, "points 3"]:
-        low, high = plan.outline_m.min(axis=0), plan.outline_m.max(axis=0)
-        grown = np.array([low - AROUND_PLAN_M, high + AROUND_PLAN_M])
-        return box_points(np.insert(grown, 1, 0.0, axis=1))
 
     def _room_bounds(self) -> Float[np.ndarray, "2 3"]:
         return room_bounds(self.scene, shell_of(self.scene), self.panel.shell.value == "walls")

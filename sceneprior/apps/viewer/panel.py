@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 from sceneprior.apps.viewer.asking import RequestFields
 from sceneprior.apps.viewer.downloads import FORMATS, download
 from sceneprior.apps.viewer.explorer import HERE, PATH_STEPS, Explorer, Folder, Shown
-from sceneprior.apps.viewer.plan import Plan
 from sceneprior.apps.viewer.words import error_words, html, room_words, wish_words
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene
@@ -41,11 +40,6 @@ class Panel:
             if source.has_latents:
                 self._add_path(source)
 
-    @property
-    def plan(self) -> Plan | None:
-        """The plan that is being drawn, if there is one."""
-        return None if self._fields is None else self._fields.drawing.plan
-
     def describe(self, shown: Shown, scene: Scene) -> None:
         """Describe the shown room and its wishes."""
         self._said.content = html(room_words(shown, scene))
@@ -76,13 +70,11 @@ class Panel:
         with gui.add_folder("New room"):
             known = explorer.distributions
             if explorer.takes_requests:
-                self._fields = RequestFields(page.server, asked, page.safely, page.draw)
+                self._fields = RequestFields(page.server, asked, page.safely)
             origin = gui.add_dropdown("From", known, initial_value=known[0]) if known else None
             seed: Any = gui.add_number("Seed", 0, min=0, step=1)
 
             def sample() -> None:
-                if self._fields is not None:
-                    self._fields.end_drawing()
                 self._sample(explorer, seed.value, None if origin is None else origin.value)
 
             def another() -> None:

@@ -136,25 +136,8 @@ def test_what_does_not_work_is_said(browser, page):
     wait_for(asked_again, "no sentence came")
 
 
-def drag(browser, page, start_m, end_m) -> None:
-    """Drag from one point of the scene to another, step by step."""
-    from selenium.webdriver import ActionChains
-
-    points = np.linspace(on_screen(page, start_m), on_screen(page, end_m), 4)
-    for number, (x, y) in enumerate(points):
-        mouse = ActionChains(browser, duration=50)
-        mouse.w3c_actions.pointer_action.move_to_location(int(x), int(y))
-        if number == 0:
-            mouse.w3c_actions.pointer_action.pointer_down()
-        mouse.perform()
-        time.sleep(0.3)
-    ActionChains(browser).release().perform()
-
-
-def test_a_floor_is_drawn_a_door_dropped_and_the_room_downloaded(browser, tmp_path):
+def test_a_request_is_typed_answered_and_downloaded(browser, tmp_path):
     pytest.importorskip("viser", reason="the extra `view` is not installed")
-    from selenium.webdriver import ActionChains
-
     from sceneprior.apps.viewer.page import Page
     from sceneprior.apps.viewer.server import serving
 
@@ -164,46 +147,18 @@ def test_a_floor_is_drawn_a_door_dropped_and_the_room_downloaded(browser, tmp_pa
         server.scene.configure_default_lights(cast_shadow=False)
         browser.set_window_size(900, 640)
         browser.get(f"http://127.0.0.1:{server.get_port()}")
-        wait_for(lambda: "Draw floor and doors" in words(browser), "no panel came")
-        wait_for(server.get_clients, "the browser did not connect")
-        (client,) = server.get_clients().values()
-        wait_for(lambda: client.client_id in page._eyes, "the room was not framed")
-        fields = page.panel._fields
-        click(browser, "Draw floor and doors")
-        wait_for(lambda: fields.floor.value == "4x3", "no plan to draw on")
-
-        def drawn() -> bool:
-            x, y = on_screen(page, (2.0, 0.06, 1.5))
-            shown = picture(browser.get_screenshot_as_png)
-            return sum(shown.getpixel((int(x), int(y)))) < 450  # the dark handle of a corner
-
-        wait_for(drawn, "no plan is drawn")
-
-        def moved() -> bool:
-            # A browser that is slow to draw may miss the beginning of a gesture.
-            drag(browser, page, (2.0, 0.06, 1.5), (2.5, 0.06, 2.0))
-            time.sleep(2)
-            return fields.drawing.plan.corners[2] != (2.0, 1.5)
-
-        def dropped() -> bool:
-            x, y = on_screen(page, (-1.7, 0.0, 0.4))
-            mouse = ActionChains(browser)
-            mouse.w3c_actions.pointer_action.move_to_location(int(x), int(y)).click()
-            mouse.perform()
-            time.sleep(2)
-            return "door@3" in fields.openings.value
-
-        wait_for(moved, "the corner did not move")
-        wait_for(dropped, "no door came")
-        extents_m = np.ptp(fields.drawing.plan.outline_m, axis=0)
-        assert (extents_m > [4, 3]).all() and fields.floor.value.startswith("-2,-1.5 2,-1.5 2")
+        wait_for(lambda: "Make room" in words(browser), "no panel came")
+        floor = browser.find_element("xpath", "//label[text()='Floor']/following::input[1]")
+        floor.send_keys("5x4")
+        doors = browser.find_element("xpath", "//label[text()='Doors']/following::input[1]")
+        doors.send_keys("door@3:1.2")
+        wait_for(lambda: page.panel._fields.openings.value == "door@3:1.2", "nothing was typed")
         click(browser, "Make room")
         wait_for(lambda: page.scene.openings, "no room was made")
         wait_for(
             lambda: "1 door" in words(browser) and "✓ 2 nightstand" in words(browser), "silence"
         )
-        np.testing.assert_allclose(np.ptp(page.scene.floor_m, axis=0), extents_m)
-        assert {each.kind for each in page.scene.openings} == {"door"}
+        np.testing.assert_allclose(np.ptp(page.scene.floor_m, axis=0), [5, 4])
         folder = {"behavior": "allow", "downloadPath": str(tmp_path)}
         browser.execute_cdp_cmd("Page.setDownloadBehavior", folder)
         button = browser.find_element("xpath", "//button[.//text()='Download']")

@@ -99,37 +99,6 @@ def test_a_request_is_answered_or_refused_in_the_panel(prior):
             page.explorer.sample(0, "paper", fields.asked())
 
 
-def test_the_drawing_fills_the_fields_and_follows_them(prior):
-    with serving("127.0.0.1", 0) as server:
-        page = Page(server, Explorer(prior), "prior")
-        fields = page.panel._fields
-        drawing = fields.drawing
-        fields._draw_or_end()
-        assert fields.floor.value == "4x3" and drawing.frame.visible
-        assert not page._room.frame.visible
-        drawing._change(drawing.plan.with_opening(drawing.kind, (0.5, -1.3)))
-        assert fields.openings.value == "door@0:2.5"
-        drawing._drag_corner("corner", 2, (2.4, 2.1), False)
-        drawing._drag_corner("corner", 2, (2.5, 2.0), True)
-        assert fields.floor.value == "-2,-1.5 2,-1.5 2.5,2 -2,1.5"
-        drawing._drag_corner("middle", 3, (-2.3, 0.0), False)
-        drawing._drag_corner("middle", 3, (-2.6, 0.2), True)
-        assert fields.floor.value == "-2,-1.5 2,-1.5 2.5,2 -2,1.5 -2.6,0.2"
-        drawing._drag_opening(0, (1.9, 0.0), True)
-        assert fields.openings.value.startswith("door@1:")
-        drawing._change(drawing.plan.without_corner(4))
-        fields.openings.value = "window@0:1"  # typed
-        assert [each.kind for each in drawing.plan.openings] == ["window"]
-        fields.floor.value = "5x"  # half-typed
-        assert drawing.plan.floor_text() == "-2,-1.5 2,-1.5 2.5,2 -2,1.5"
-        fields._draw_or_end()
-        assert fields.floor.value == "-2.25,-1.75 1.75,-1.75 2.25,1.75 -2.25,1.25"
-        assert page._room.frame.visible and drawing.plan is None
-
-
-pytest.importorskip("viser", reason="the extra `view` is not installed")
-
-
 def test_models_come_and_go():
     bed = SceneObject("double_bed", (0.0, 0.5, 0.0), (2.0, 1.0, 2.2))
     with serving("127.0.0.1", 0) as server:
