@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from posed_files import PosedRoom, prepared
+from posed_files import PosedRoom, Thing, prepared
 from pycocotools import mask as coco
 from scipy.spatial.transform import Rotation
 
@@ -219,6 +219,41 @@ def write_coco_video(room: PosedRoom) -> None:
         for k, thing in enumerate(room.things)
     ]  # fmt: skip
     write_coco_json(room, "instances.json", {"videos": [video], "annotations": rows})
+
+
+SEGMENTS = {3: 70_001, 300: 5, 7: 1_000_000, 11: 256}
+"""Ids of COCO's kind for those of the things and of a wall."""
+
+
+def write_panoptic(room, change=lambda data: None):
+    wall = Thing(11, "wall-brick", (-3.0, 3.0, 0.0), (3.0, 3.1, 2.5))
+    room.things.append(wall)
+    room.write(floor_m=0.0, floor_center_m=[0.1, -0.2])
+    (room.folder / "classes.json").unlink()
+    names = {"bed": 65, "Chair": 62, "backpack": 27, "wall-brick": 171}
+    annotations = []
+    for view in range(len(room.poses)):
+        ids = room.ids(view).astype(int)
+        for mine, theirs in SEGMENTS.items():
+            ids[ids == mine] = theirs
+        colours = np.stack([ids % 256, ids // 256 % 256, ids // 65536], axis=-1)
+        Image.fromarray(colours.astype(np.uint8)).save(room.png(view))
+        segments = [
+            {"id": SEGMENTS[thing.id], "category_id": names[thing.name], "area": 3, "iscrowd": 0}
+            for thing in room.things
+            if (ids == SEGMENTS[thing.id]).any()
+        ]
+        annotations.append({"file_name": room.png(view).name, "segments_info": segments})
+    data = {
+        "images": [],
+        "annotations": annotations,
+        "categories": [
+            {"id": number, "name": name, "isthing": int(name != "wall-brick")}
+            for name, number in names.items()
+        ],
+    }
+    change(data)
+    (room.folder / "panoptic.json").write_text(json.dumps(data))
 
 
 # -- Comparisons -----------------------------------------------------------------------------------

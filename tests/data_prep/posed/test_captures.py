@@ -6,6 +6,7 @@ import struct
 import cv2
 import numpy as np
 import pytest
+from capture_files import SEGMENTS, write_panoptic
 from colmap_files import SCALE, TURN, write_colmap
 from PIL import Image
 from posed_files import SET, PosedRoom, Thing, in_room, overlaps, prepared
@@ -230,41 +231,6 @@ def test_frames_of_one_name_have_ids_where_the_frames_lie(room):
         path.parent.mkdir(exist_ok=True)
         room.png(k).rename(path)
     assert len(prepared(room).views.visible) == 5
-
-
-SEGMENTS = {3: 70_001, 300: 5, 7: 1_000_000, 11: 256}
-"""Ids of COCO's kind for those of the things and of a wall."""
-
-
-def write_panoptic(room, change=lambda data: None):
-    wall = Thing(11, "wall-brick", (-3.0, 3.0, 0.0), (3.0, 3.1, 2.5))
-    room.things.append(wall)
-    room.write(floor_m=0.0, floor_center_m=[0.1, -0.2])
-    (room.folder / "classes.json").unlink()
-    names = {"bed": 65, "Chair": 62, "backpack": 27, "wall-brick": 171}
-    annotations = []
-    for view in range(len(room.poses)):
-        ids = room.ids(view).astype(int)
-        for mine, theirs in SEGMENTS.items():
-            ids[ids == mine] = theirs
-        colours = np.stack([ids % 256, ids // 256 % 256, ids // 65536], axis=-1)
-        Image.fromarray(colours.astype(np.uint8)).save(room.png(view))
-        segments = [
-            {"id": SEGMENTS[thing.id], "category_id": names[thing.name], "area": 3, "iscrowd": 0}
-            for thing in room.things
-            if (ids == SEGMENTS[thing.id]).any()
-        ]
-        annotations.append({"file_name": room.png(view).name, "segments_info": segments})
-    data = {
-        "images": [],
-        "annotations": annotations,
-        "categories": [
-            {"id": number, "name": name, "isthing": int(name != "wall-brick")}
-            for name, number in names.items()
-        ],
-    }
-    change(data)
-    (room.folder / "panoptic.json").write_text(json.dumps(data))
 
 
 def test_panoptic_masks_are_tracks_with_classes(room):
