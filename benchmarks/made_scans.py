@@ -26,15 +26,15 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from data_prep.engine.selection import read_splits
-from data_prep.frames import Y_UP
 from data_prep.front.furnished import Room
 from data_prep.front.houses import house_files
 from data_prep.front.models import ModelBank
 from data_prep.front.recipe import Recipe, load_recipe
 from data_prep.front.rooms import read_house
-from data_prep.public.nyu40 import LIKE_NYU40, NYU40
-from data_prep.scannet.labels import Labels, read_labels
-from data_prep.scannet.scans import ScanSettings, read_scan
+from data_prep.readers.frames import Y_UP
+from data_prep.readers.nyu40 import LIKE_NYU40, NYU40
+from data_prep.readers.scannet.labels import Labels, read_labels
+from data_prep.readers.scannet.scans import ScanSettings, read_scan
 from sceneprior.core.classes import STUFF, label_set
 
 sys.path.append(str(Path(__file__).parents[1] / "tests" / "data_prep" / "scannet"))

@@ -27,8 +27,8 @@ from data_prep.homes.make import make_homes
 from data_prep.inspection.causes import GIVEN
 from data_prep.inspection.verdicts import what_was_checked
 from data_prep.inspection.verify import verify
-from data_prep.posed.source import PosedSource
-from data_prep.posed.views import PosedSettings
+from data_prep.readers.posed.source import PosedSource
+from data_prep.readers.posed.views import PosedSettings
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.shards import RoomViews, iterate_rooms, read_index

@@ -17,7 +17,7 @@ import shapely
 import trimesh
 from tracks import NOISES, ideal_ids, rooms, shuffled
 
-from data_prep.heading import find_turn, turn_matrix
+from data_prep.readers.heading import find_turn, turn_matrix
 from sceneprior.core.geometry.turns import yaw_rotation
 from sceneprior.core.instances.observations import observe
 from sceneprior.core.shards import MODELS_FOLDER, RoomGroundTruth, RoomViews

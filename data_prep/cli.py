@@ -148,8 +148,8 @@ def prep_scannet(
     Exit status: 0, or 3 if scans failed (the others are prepared; report.csv says why).
     """
     from data_prep.engine.build import Job
-    from data_prep.scannet.scans import FULL_SIZE, QUARTER_SIZE, ScanSettings
-    from data_prep.scannet.source import ScanNetSource
+    from data_prep.readers.scannet.scans import FULL_SIZE, QUARTER_SIZE, ScanSettings
+    from data_prep.readers.scannet.source import ScanNetSource
 
     size = FULL_SIZE if full_size else QUARTER_SIZE
     settings = ScanSettings(frame_step, max_views, masks, size)
@@ -217,10 +217,10 @@ def prep_posed(
     Exit status: 0, or 3 if rooms failed (the others are prepared; report.csv says why).
     """
     from data_prep.engine.build import Job
-    from data_prep.posed.formats import read_formats
-    from data_prep.posed.labels import read_label_set
-    from data_prep.posed.source import PosedSource
-    from data_prep.posed.views import PosedSettings
+    from data_prep.readers.posed.formats import read_formats
+    from data_prep.readers.posed.labels import read_label_set
+    from data_prep.readers.posed.source import PosedSource
+    from data_prep.readers.posed.views import PosedSettings
 
     settings = PosedSettings(
         up, floor_m, camera_height_m, metres_per_unit, max_side, tracks, max_views
@@ -269,7 +269,7 @@ def prep_dataset(
     Exit status: 0, or 3 if rooms failed (the others are prepared; report.csv says why).
     """
     from data_prep.engine.build import Job
-    from data_prep.public.source import PublicSource, open_reader
+    from data_prep.readers.source import PublicSource, open_reader
 
     reader = open_reader(name, folder, recipe)
     source = PublicSource(reader, splits, max_side, max_views, seed, only)

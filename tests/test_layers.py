@@ -57,7 +57,7 @@ BUDGET = {
 it bought and what went for it."""
 
 OWNERS = {
-    "h5py": ["sceneprior/core/shard", "data_prep/public/hdf5.py"],
+    "h5py": ["sceneprior/core/shard", "data_prep/readers/files.py"],
     "pyrender": ["sceneprior/render/offscreen/"],
     "OpenGL": ["sceneprior/render/offscreen/"],
     "numba": [
@@ -90,7 +90,7 @@ OWNERS = {
         "sceneprior/paper/losses/matching.py",
         "sceneprior/evaluation/", "data_prep/inspection/truth_causes.py",
     ],
-    "cv2": ["data_prep/posed/lens.py", "sceneprior/evaluation/metrics/"],
+    "cv2": ["data_prep/readers/posed/lens.py", "sceneprior/evaluation/metrics/"],
     "viser": ["sceneprior/apps/viewer/"],
     "mujoco": ["sceneprior/evaluation/metrics/stability.py"],
     "coacd": ["sceneprior/core/colliders.py"],

@@ -8,7 +8,7 @@ import numpy as np
 
 from data_prep.inspection.bodies import KINDS, Body
 from data_prep.inspection.projection import box_iou_2d, boxes_around
-from data_prep.upright import own_sides
+from data_prep.readers.upright import own_sides
 from sceneprior.core.shards import RoomViews
 
 MARGIN = 0.02

@@ -7,7 +7,7 @@ from scipy.stats import rankdata
 
 from data_prep.inspection.causes import GIVEN, Cause, Convention, corrected
 from data_prep.inspection.triangulation import Middles, fit, middles
-from data_prep.posed.floor import find_floor
+from data_prep.readers.posed.floor import find_floor
 from sceneprior.core.cameras import camera_centers
 from sceneprior.core.shards import RoomViews
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from data_prep.upright import own_sides
+from data_prep.readers.upright import own_sides
 from sceneprior.core.cameras import camera_centers
 from sceneprior.core.shards import RoomViews
 

@@ -29,9 +29,9 @@ from data_prep.engine.build import Job, build_shards
 from data_prep.front.furnished import Room
 from data_prep.front.recipe import load_recipe
 from data_prep.homes.make import make_homes
-from data_prep.scannet.labels import Labels, read_labels
-from data_prep.scannet.scans import ScanSettings
-from data_prep.scannet.source import ScanNetSource
+from data_prep.readers.scannet.labels import Labels, read_labels
+from data_prep.readers.scannet.scans import ScanSettings
+from data_prep.readers.scannet.source import ScanNetSource
 from sceneprior.core.classes import STUFF, label_set
 from sceneprior.core.shards import Shard, list_shards
 

@@ -4,8 +4,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from data_prep.frames import choose_frames, is_pose, mask_intrinsics, room_cameras, sampled_lines
-from data_prep.scannet.scans import FULL_SIZE, QUARTER_SIZE
+from data_prep.readers.frames import (
+    choose_frames,
+    is_pose,
+    mask_intrinsics,
+    room_cameras,
+    sampled_lines,
+)
+from data_prep.readers.scannet.scans import FULL_SIZE, QUARTER_SIZE
 from sceneprior.core.errors import InputError
 
 

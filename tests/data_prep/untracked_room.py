@@ -3,7 +3,7 @@
 import numpy as np
 from posed_files import PosedRoom, Thing
 
-from data_prep.frames import room_cameras
+from data_prep.readers.frames import room_cameras
 from data_prep.tracks.associate import FrameMasks
 
 

@@ -27,11 +27,11 @@ from data_prep.front.filters import broken_rule
 from data_prep.front.models import ModelBank
 from data_prep.front.recipe import load_recipe
 from data_prep.front.rooms import read_house
-from data_prep.posed.source import PosedSource
-from data_prep.posed.views import PosedSettings, prepare_posed
-from data_prep.scannet.labels import read_labels
-from data_prep.scannet.scans import ScanSettings, read_scan
-from data_prep.scannet.views import prepare_scan
+from data_prep.readers.posed.source import PosedSource
+from data_prep.readers.posed.views import PosedSettings, prepare_posed
+from data_prep.readers.scannet.labels import read_labels
+from data_prep.readers.scannet.scans import ScanSettings, read_scan
+from data_prep.readers.scannet.views import prepare_scan
 from sceneprior.core.errors import InputError
 from sceneprior.core.instances.coco import read_coco
 

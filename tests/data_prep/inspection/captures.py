@@ -12,8 +12,8 @@ from data_prep.engine.build import Job, build_shards
 from data_prep.front.recipe import load_recipe
 from data_prep.front.source import FrontSource
 from data_prep.homes.make import make_homes
-from data_prep.posed.source import PosedSource
-from data_prep.posed.views import PosedSettings
+from data_prep.readers.posed.source import PosedSource
+from data_prep.readers.posed.views import PosedSettings
 from sceneprior.core.classes import label_set
 from sceneprior.core.shards import Shard, iterate_rooms, read_index
 

@@ -12,9 +12,9 @@ from data_prep.engine.build import Job, build_shards
 from data_prep.front.recipe import load_recipe
 from data_prep.front.source import FrontSource
 from data_prep.homes.make import make_homes
-from data_prep.posed.source import PosedSource
-from data_prep.scannet.scans import ScanSettings
-from data_prep.scannet.source import ScanNetSource
+from data_prep.readers.posed.source import PosedSource
+from data_prep.readers.scannet.scans import ScanSettings
+from data_prep.readers.scannet.source import ScanNetSource
 
 OPENGL = np.diag([1.0, -1, -1, 1])
 

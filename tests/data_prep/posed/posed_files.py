@@ -12,10 +12,10 @@ from scan_files import BOX_FACES
 
 from data_prep.engine.source import PreparedRoom
 from data_prep.inspection.projection import box_iou_2d, boxes_around, hull_of
-from data_prep.posed.formats import read_formats
-from data_prep.posed.source import PosedSource
-from data_prep.posed.views import PosedSettings, prepare_posed
-from data_prep.upright import own_sides
+from data_prep.readers.posed.formats import read_formats
+from data_prep.readers.posed.source import PosedSource
+from data_prep.readers.posed.views import PosedSettings, prepare_posed
+from data_prep.readers.upright import own_sides
 from sceneprior.core.shards import RoomViews
 from sceneprior.render.offscreen.zbuffer import rasterize
 

@@ -12,8 +12,8 @@ from PIL import Image
 from posed_files import SET, PosedRoom, Thing, in_room, overlaps, prepared
 from scipy.spatial.transform import Rotation
 
-from data_prep.posed.source import PosedSource
-from data_prep.posed.transforms import read_recording
+from data_prep.readers.posed.source import PosedSource
+from data_prep.readers.posed.transforms import read_recording
 from sceneprior.core.classes import STUFF
 from sceneprior.core.errors import InputError
 from sceneprior.core.shards import stuff_step, thinned

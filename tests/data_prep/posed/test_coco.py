@@ -68,7 +68,7 @@ def test_coco_videos_that_cannot_be_used(room, change, said):
 
 @pytest.mark.parametrize("video", [True, False])
 def test_more_objects_than_ids(room, video, monkeypatch):
-    monkeypatch.setattr("data_prep.posed.coco.LARGEST_ID", 3)
+    monkeypatch.setattr("data_prep.readers.posed.coco.LARGEST_ID", 3)
     if video:
         tools.write_coco_video(room)
         assert "instances.json has 3 objects; expected at most 2." in refusal(room)

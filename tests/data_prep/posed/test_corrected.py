@@ -6,9 +6,9 @@ from posed_files import prepared
 from scipy.spatial.transform import Rotation
 from untracked_room import furnished
 
-from data_prep.frames import room_cameras
-from data_prep.posed.corrected import _adjusted, _gaps, correct, moved_cameras
-from data_prep.posed.tangents import find_outlines
+from data_prep.readers.frames import room_cameras
+from data_prep.readers.posed.corrected import _adjusted, _gaps, correct, moved_cameras
+from data_prep.readers.posed.tangents import find_outlines
 from sceneprior.core.instances.observations import observe
 
 DEGREES, METRES = 0.5, 0.01
@@ -83,7 +83,7 @@ def test_a_step_solves_the_normal_equations_of_all_gaps(given, monkeypatch):
     images, true, intrinsics = given
     outlines = find_outlines(seen_in(images), intrinsics)
     poses = moved_cameras(true, errors(len(true)))
-    monkeypatch.setattr("data_prep.posed.corrected._ROUNDS", 1)
+    monkeypatch.setattr("data_prep.readers.posed.corrected._ROUNDS", 1)
     gaps = _gaps(outlines, poses, np.zeros((len(poses), 6)))
     used = gaps.valid[:, None] & gaps.clear.all(axis=2)
     scale = max(1.0, np.median(np.abs(gaps.gaps_px[used])))

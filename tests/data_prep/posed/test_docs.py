@@ -36,8 +36,8 @@ def test_the_example_runs_as_printed(tmp_path, monkeypatch):
 
 
 def test_every_key_that_is_read_is_in_the_document():
-    from data_prep.posed import transforms
-    from data_prep.posed.recording import Camera
+    from data_prep.readers.posed import transforms
+    from data_prep.readers.posed.recording import Camera
     from sceneprior.core.instances import tables
 
     text = DOCUMENT.read_text()

@@ -9,9 +9,9 @@ from PIL import Image
 from posed_files import SET, PosedRoom, furniture, prepared
 from test_untracked import same_objects
 
-from data_prep.posed.formats import MASKS, read_formats
-from data_prep.posed.source import PosedSource
-from data_prep.posed.transforms import POSES, read_recording
+from data_prep.readers.posed.formats import MASKS, read_formats
+from data_prep.readers.posed.source import PosedSource
+from data_prep.readers.posed.transforms import POSES, read_recording
 from sceneprior.core.errors import InputError
 
 TRACKED = {

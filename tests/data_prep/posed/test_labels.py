@@ -2,7 +2,7 @@
 
 import pytest
 
-from data_prep.posed.labels import find_table, read_label_set
+from data_prep.readers.posed.labels import find_table, read_label_set
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.instances.tables import read_class_table

@@ -8,7 +8,7 @@ import pytest
 from capture_files import refusal, same_masks
 from posed_files import prepared
 
-from data_prep.posed.transforms import read_recording
+from data_prep.readers.posed.transforms import read_recording
 
 
 @pytest.mark.parametrize("folder", ["corrected_cameras", "cameras"])

@@ -12,8 +12,8 @@ from tiny_runs import tiny_config
 from data_prep.engine.build import Job, build_shards
 from data_prep.engine.source import RoomTask
 from data_prep.engine.workers import pool
-from data_prep.posed.source import PosedSource, find_rooms
-from data_prep.posed.views import PosedSettings
+from data_prep.readers.posed.source import PosedSource, find_rooms
+from data_prep.readers.posed.views import PosedSettings
 from sceneprior.core.data.dataset import ViewDataset
 from sceneprior.core.errors import InputError
 from sceneprior.core.ground_truth import reference_scenes

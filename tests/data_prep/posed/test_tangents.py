@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from untracked_room import frames, furnished
 
-from data_prep.posed import tangents
-from data_prep.posed.tangents import find_outlines, hull_corners, measure_gaps
+from data_prep.readers.posed import tangents
+from data_prep.readers.posed.tangents import find_outlines, hull_corners, measure_gaps
 from sceneprior.core.instances.observations import observe
 
 

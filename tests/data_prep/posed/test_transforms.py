@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from posed_files import PosedRoom
 
-from data_prep.posed.recording import frame_intrinsics, room_name
-from data_prep.posed.transforms import read_recording
+from data_prep.readers.posed.recording import frame_intrinsics, room_name
+from data_prep.readers.posed.transforms import read_recording
 from sceneprior.core.errors import InputError
 
 

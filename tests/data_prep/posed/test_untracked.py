@@ -7,8 +7,8 @@ import pytest
 from PIL import Image
 from posed_files import SET, PosedRoom, prepared
 
-from data_prep.posed.source import PosedSource
-from data_prep.posed.views import PosedSettings
+from data_prep.readers.posed.source import PosedSource
+from data_prep.readers.posed.views import PosedSettings
 from sceneprior.core.errors import InputError
 
 

@@ -8,9 +8,9 @@ from PIL import Image
 from posed_files import SET, PosedRoom, furniture, in_room, overlaps, prepared
 
 from data_prep.inspection.checks import array_problems, mask_problems
-from data_prep.posed.cameras import cameras_in_room, seems_up, upright_cameras
-from data_prep.posed.transforms import read_recording
-from data_prep.posed.views import PosedSettings
+from data_prep.readers.posed.cameras import cameras_in_room, seems_up, upright_cameras
+from data_prep.readers.posed.transforms import read_recording
+from data_prep.readers.posed.views import PosedSettings
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.geometry.turns import quarter_rotation, yaw_rotation

@@ -8,7 +8,7 @@ import pytest
 from public_files import furnished, write_blenderproc, write_hdf5
 
 from data_prep.engine.workers import pool
-from data_prep.public.source import PublicSource, open_reader
+from data_prep.readers.source import PublicSource, open_reader
 from sceneprior.core.errors import InputError
 
 

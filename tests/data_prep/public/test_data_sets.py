@@ -20,12 +20,12 @@ from public_files import (
 )
 
 from data_prep.engine.workers import pool
-from data_prep.frames import GL_TO_CV, Y_UP
-from data_prep.heading import turn_matrix
 from data_prep.inspection.projection import boxes_around, hull_of
-from data_prep.public.rooms import FramedRoom, prepare_room
-from data_prep.public.source import PublicSource, open_reader
-from data_prep.upright import own_sides
+from data_prep.readers.frames import GL_TO_CV, Y_UP
+from data_prep.readers.heading import turn_matrix
+from data_prep.readers.rooms import FramedRoom, prepare_room
+from data_prep.readers.source import PublicSource, open_reader
+from data_prep.readers.upright import own_sides
 from sceneprior.core.classes import STUFF, label_set
 from sceneprior.core.geometry.turns import quarter_rotation
 from sceneprior.core.ground_truth import reference_scenes

@@ -9,7 +9,7 @@ import pytest
 from public_files import cam_from_uv, furnished, write_hdf5, write_hypersim
 
 from data_prep.engine.source import RoomTask
-from data_prep.public.source import PublicSource, open_reader
+from data_prep.readers.source import PublicSource, open_reader
 from sceneprior.core.errors import InputError
 
 SCENE = "ai_001_001"

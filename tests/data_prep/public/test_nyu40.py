@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from data_prep.public.nyu40 import NYU40, ids_and_classes
-from data_prep.scannet.labels import SHELL
+from data_prep.readers.nyu40 import NYU40, ids_and_classes
+from data_prep.readers.scannet.labels import SHELL
 from sceneprior.core.classes import STUFF, label_set
 from sceneprior.core.errors import InputError
 

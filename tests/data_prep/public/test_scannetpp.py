@@ -9,7 +9,7 @@ from scan_files import write_table
 
 from data_prep.engine.source import RoomTask
 from data_prep.engine.workers import pool
-from data_prep.public.source import PublicSource, open_reader
+from data_prep.readers.source import PublicSource, open_reader
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 

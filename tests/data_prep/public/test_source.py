@@ -4,7 +4,7 @@ import pytest
 from public_files import furnished, write_scannetpp, write_structured3d
 
 from data_prep.engine.workers import pool
-from data_prep.public.source import DATA_SETS, PublicSource, open_reader
+from data_prep.readers.source import DATA_SETS, PublicSource, open_reader
 from sceneprior.core.errors import InputError
 
 

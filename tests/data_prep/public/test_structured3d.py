@@ -8,7 +8,7 @@ from PIL import Image
 from public_files import furnished, write_structured3d
 
 from data_prep.engine.workers import pool
-from data_prep.public.source import PublicSource, open_reader
+from data_prep.readers.source import PublicSource, open_reader
 from sceneprior.core.errors import InputError
 
 VIEW = "2D_rendering/480/perspective/full/0"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from public_files import cam_from_uv, furnished
 
-from data_prep.public.tilt import pinhole, straight_grid
+from data_prep.readers.tilt import pinhole, straight_grid
 
 
 @pytest.mark.parametrize("shifts", [(0.0, 0.0), (0.3, 0.0), (-0.8, 0.0), (-0.07, -0.17)])

@@ -12,7 +12,7 @@ from public_files import (
 
 from data_prep.engine.source import Line, PreparedRoom
 from data_prep.engine.workers import pool
-from data_prep.public.source import PublicSource, open_reader
+from data_prep.readers.source import PublicSource, open_reader
 from sceneprior.core.errors import InputError
 
 

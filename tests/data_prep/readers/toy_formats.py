@@ -24,11 +24,11 @@ from scipy.spatial.transform import Rotation
 
 from data_prep.engine.source import PreparedRoom, Source
 from data_prep.engine.workers import pool
-from data_prep.posed.source import PosedSource
-from data_prep.posed.views import PosedSettings
-from data_prep.public.source import PublicSource, open_reader
-from data_prep.scannet.scans import ScanSettings
-from data_prep.scannet.source import ScanNetSource
+from data_prep.readers.posed.source import PosedSource
+from data_prep.readers.posed.views import PosedSettings
+from data_prep.readers.scannet.scans import ScanSettings
+from data_prep.readers.scannet.source import ScanNetSource
+from data_prep.readers.source import PublicSource, open_reader
 
 Write = Callable[[Path], Source]
 

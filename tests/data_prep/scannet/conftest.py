@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from scan_files import ScanFolder, make_scan, write_table
 
-from data_prep.scannet.labels import Labels, read_labels
+from data_prep.readers.scannet.labels import Labels, read_labels
 
 
 @pytest.fixture

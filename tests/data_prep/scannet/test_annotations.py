@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scan_files import BOX_FACES, write_ply
 
-from data_prep.scannet.annotations import (
+from data_prep.readers.scannet.annotations import (
     Group,
     axis_alignment,
     read_groups,

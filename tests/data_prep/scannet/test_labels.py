@@ -3,7 +3,7 @@
 import pytest
 from scan_files import TABLE, write_table
 
-from data_prep.scannet.labels import read_labels
+from data_prep.readers.scannet.labels import read_labels
 from sceneprior.core.classes import STUFF
 from sceneprior.core.errors import InputError
 

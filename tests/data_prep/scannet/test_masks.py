@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 from scan_files import png, write_zip
 
-from data_prep.scannet.masks import MaskArchive
+from data_prep.readers.scannet.masks import MaskArchive
 from sceneprior.core.errors import InputError
 
 

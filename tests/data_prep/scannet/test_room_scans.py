@@ -13,11 +13,11 @@ from scan_files import png, write_table, write_zip
 from data_prep.engine.build import Job, build_shards
 from data_prep.inspection.bodies import true_bodies
 from data_prep.inspection.verify import verify
-from data_prep.scannet.labels import read_labels
-from data_prep.scannet.occlusion import unoccluded
-from data_prep.scannet.scans import ScanSettings, read_scan
-from data_prep.scannet.source import ScanNetSource
-from data_prep.scannet.views import prepare_scan
+from data_prep.readers.scannet.labels import read_labels
+from data_prep.readers.scannet.occlusion import unoccluded
+from data_prep.readers.scannet.scans import ScanSettings, read_scan
+from data_prep.readers.scannet.source import ScanNetSource
+from data_prep.readers.scannet.views import prepare_scan
 from sceneprior.core.shard_writing import room_checksum
 from sceneprior.core.shards import Shard
 from sceneprior.render.offscreen.zbuffer import rasterize

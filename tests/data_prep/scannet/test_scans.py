@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scan_files import sens_bytes, write_zip
 
-from data_prep.scannet.scans import FULL_SIZE, ScanSettings, read_scan
+from data_prep.readers.scannet.scans import FULL_SIZE, ScanSettings, read_scan
 from sceneprior.core.errors import InputError
 
 EVERY = ScanSettings(frame_step=1)

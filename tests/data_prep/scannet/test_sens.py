@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scan_files import SCANNET_K, frame_header, png, sens_bytes, sens_header
 
-from data_prep.scannet.sens import read_recording
+from data_prep.readers.scannet.sens import read_recording
 from sceneprior.core.errors import InputError
 
 SIZE = (24, 32)

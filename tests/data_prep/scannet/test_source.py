@@ -9,8 +9,8 @@ from scan_files import make_scan, write_table
 from data_prep.engine.build import Job, build_shards
 from data_prep.engine.source import Line, RoomTask
 from data_prep.engine.workers import pool
-from data_prep.scannet.scans import ScanSettings
-from data_prep.scannet.source import ScanNetSource
+from data_prep.readers.scannet.scans import ScanSettings
+from data_prep.readers.scannet.source import ScanNetSource
 from sceneprior.core.errors import InputError
 from sceneprior.core.shards import iterate_rooms
 

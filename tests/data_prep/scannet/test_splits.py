@@ -2,7 +2,7 @@
 
 import pytest
 
-from data_prep.scannet.splits import find_scans, split_scans
+from data_prep.readers.scannet.splits import find_scans, split_scans
 from sceneprior.core.errors import InputError
 
 

@@ -18,8 +18,8 @@ from scan_files import (
 )
 
 from data_prep.inspection.projection import box_iou_2d
-from data_prep.scannet.scans import FULL_SIZE, QUARTER_SIZE, ScanSettings, read_scan
-from data_prep.scannet.views import instance_images, prepare_scan
+from data_prep.readers.scannet.scans import FULL_SIZE, QUARTER_SIZE, ScanSettings, read_scan
+from data_prep.readers.scannet.views import instance_images, prepare_scan
 from sceneprior.core.classes import STUFF, label_set
 from sceneprior.render.offscreen.zbuffer import rasterize
 

@@ -1,0 +1,215 @@
+"""Reads Hypersim: synthetic scenes with camera trajectories; cameras may be tilt-shift.
+
+    <folder>/metadata_camera_parameters.csv     projection of each scene (contrib/mikeroberts3000)
+    <folder>/<scene>/_detail/metadata_scene.csv meters_per_asset_unit
+        _detail/cam_XX/camera_keyframe_{positions,orientations}.hdf5
+        _detail/mesh/metadata_semantic_instance_bounding_box_object_aligned_2d_*.hdf5
+        images/scene_cam_XX_geometry_hdf5/frame.IIII.{semantic_instance,semantic}.hdf5
+
+The world is in asset units, z up; cameras have OpenGL's axes. A scene is a room, and all its
+trajectories are its views.
+
+Source: the README, scene_generate_images_bounding_box.py and contrib/mikeroberts3000 of
+apple/ml-hypersim.
+"""
+
+import csv
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from data_prep.engine.source import RoomTask
+from data_prep.readers.files import read_hdf5
+from data_prep.readers.frames import GL_TO_CV, Y_UP
+from data_prep.readers.nyu40 import ids_and_classes
+from data_prep.readers.rooms import (
+    FoundRoom,
+    FramedRoom,
+    Reader,
+    chosen_frames,
+    corners_of,
+    sampled,
+)
+from data_prep.readers.tilt import pinhole, straight_grid
+from sceneprior.core.errors import InputError
+from sceneprior.core.instances.checked import plain
+
+CAMERAS = "metadata_camera_parameters.csv"
+_BOXES = "metadata_semantic_instance_bounding_box_object_aligned_2d_{}.hdf5"
+_HINT = "download the scene again"
+
+
+@dataclass(frozen=True)
+class Hypersim(Reader):
+    """Hypersim's scenes."""
+
+    name: ClassVar = "hypersim"
+
+    def settings(self) -> dict[str, Any]:
+        """See `Reader.settings`."""
+        _camera_rows(self.folder / CAMERAS)
+        return {}
+
+    def scenes(self) -> list[str]:
+        """See `Reader.scenes`."""
+        return sorted(
+            path.name
+            for path in self.folder.iterdir()
+            if re.fullmatch(r"ai_\d{3}_\d{3}", path.name) and (path / "_detail").is_dir()
+        )
+
+    def rooms(self, scene: str) -> dict[str, FoundRoom]:
+        """The scene as one room."""
+        row = _camera_row(self.folder / CAMERAS, scene)
+        return {scene: FoundRoom(_image_size(row))}
+
+    def read(self, task: RoomTask, max_side: int | None, max_views: int) -> FramedRoom:
+        """See `Reader.read`."""
+        scene = self.folder / task.house
+        row = _camera_row(self.folder / CAMERAS, task.house)
+        size = _image_size(row)
+        intrinsics, tilt = pinhole(_cam_from_uv(row), size)
+        unit = _metres_per_unit(scene / "_detail" / "metadata_scene.csv")
+        images, poses = _trajectories(scene, unit)
+        with_ids = [k for k, paths in enumerate(images) if all(path.is_file() for path in paths)]
+        choice = chosen_frames(str(scene), poses, with_ids, max_views)
+        lines, inside = straight_grid(sampled(size, max_side, intrinsics)[0], intrinsics, size)
+        intrinsics[0, 1] = 0
+        intrinsics = sampled(size, max_side, intrinsics)[1]
+        arrays = [
+            [np.where(inside, _image(path, size)[lines], -1) for path in images[k]]
+            for k in choice.frames
+        ]
+        instances, semantics = (np.stack(kind) for kind in zip(*arrays, strict=True))
+        del arrays
+        ids, classes, stuff = ids_and_classes(instances, semantics, str(scene))
+        cameras = Y_UP @ poses[list(choice.frames)] @ GL_TO_CV
+        cameras[:, :3, :3] = cameras[:, :3, :3] @ tilt.T
+        boxes = _boxes(scene / "_detail" / "mesh", unit)
+        return FramedRoom(
+            ids, classes, cameras, intrinsics, boxes, stuff=stuff,
+            notes=tuple(choice.notes("image of ids")),
+        )  # fmt: skip
+
+
+def _camera_rows(path: Path) -> dict[str, dict[str, str]]:
+    """Rows of the table of cameras by scene."""
+    if not path.is_file():
+        raise InputError(
+            f"{path} is missing: the projection of each scene. Copy it from "
+            "contrib/mikeroberts3000 of Hypersim's code (github.com/apple/ml-hypersim)."
+        )
+    rows = _csv_rows(path)
+    if not rows or not {"scene_name", "M_cam_from_uv_00"} <= set(rows[0]):
+        raise InputError(
+            f"{path} has no columns scene_name and M_cam_from_uv_00 to _22; copy it again from "
+            "contrib/mikeroberts3000 of Hypersim's code."
+        )
+    return {row["scene_name"]: row for row in rows}
+
+
+def _camera_row(path: Path, scene: str) -> dict[str, str]:
+    rows = _camera_rows(path)
+    if scene not in rows:
+        raise InputError(f"{path} has no row for {plain(scene)}.")
+    return rows[scene]
+
+
+def _csv_rows(path: Path) -> list[dict[str, str]]:
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            return list(csv.DictReader(file))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path} cannot be read ({plain(str(error), 120)}); {_HINT}.") from None
+
+
+def _numbers(row: dict[str, str], names: list[str], where: str) -> np.ndarray:
+    try:
+        values = np.array([float(row[name]) for name in names])
+    except (KeyError, TypeError, ValueError):
+        values = np.array([np.nan])
+    if not np.isfinite(values).all():
+        raise InputError(f"{where} has no numbers in {names[0]} to {names[-1]}; it is damaged.")
+    return values
+
+
+def _image_size(row: dict[str, str]) -> tuple[int, int]:
+    names = ["settings_output_img_height", "settings_output_img_width"]
+    height, width = _numbers(row, names, f"{CAMERAS}, {row['scene_name']}")
+    return int(height), int(width)
+
+
+def _cam_from_uv(row: dict[str, str]) -> np.ndarray:
+    names = [f"M_cam_from_uv_{i}{j}" for i in range(3) for j in range(3)]
+    where = f"{CAMERAS}, {row['scene_name']}"
+    matrix = _numbers(row, names, where).reshape(3, 3)
+    if not np.linalg.det(matrix) < -1e-6:  # a camera looks along -z
+        raise InputError(f"{where}: M_cam_from_uv is no projection; it is damaged.")
+    return matrix
+
+
+def _metres_per_unit(path: Path) -> float:
+    rows = {row.get("parameter_name"): row for row in _csv_rows(path)}
+    row = rows.get("meters_per_asset_unit", {})
+    (value,) = _numbers(row, ["parameter_value"], f"{path}, meters_per_asset_unit,")
+    if value <= 0:
+        raise InputError(f"{path}: meters_per_asset_unit is {value:g}; it is damaged.")
+    return float(value)
+
+
+def _trajectories(scene: Path, unit: float) -> tuple[list[tuple[Path, Path]], np.ndarray]:
+    """Paths of each frame's id image and class image, and camera-to-world matrices in metres."""
+    images: list[tuple[Path, Path]] = []
+    poses: list[np.ndarray] = []
+    for folder in sorted((scene / "_detail").glob("cam_*")):
+        positions, turns = (
+            read_hdf5(folder / f"camera_keyframe_{name}.hdf5", ("dataset",), _HINT)[0]
+            for name in ("positions", "orientations")
+        )
+        count = len(positions)
+        if positions.shape != (count, 3) or turns.shape != (count, 3, 3):
+            raise InputError(
+                f"{folder}: camera_keyframe_positions have the shape {positions.shape} and "
+                f"orientations {turns.shape}, expected (n, 3) and (n, 3, 3); {_HINT}."
+            )
+        cameras = np.tile(np.eye(4), (count, 1, 1))
+        cameras[:, :3, :3], cameras[:, :3, 3] = turns, positions * unit
+        poses.append(cameras)
+        pictures = scene / "images" / f"scene_{folder.name}_geometry_hdf5"
+        for k in range(count):
+            start = pictures / f"frame.{k:04d}"
+            images.append((Path(f"{start}.semantic_instance.hdf5"), Path(f"{start}.semantic.hdf5")))
+    if not images:
+        raise InputError(f"{scene} has no trajectory in _detail/cam_XX; {_HINT}.")
+    return images, np.concatenate(poses)
+
+
+def _image(path: Path, size: tuple[int, int]) -> np.ndarray:
+    (image,) = read_hdf5(path, ("dataset",), _HINT)
+    if image.shape != size or image.dtype.kind not in "iu":
+        raise InputError(
+            f"{path} holds {image.dtype} of the shape {image.shape}, expected integers of {size}; "
+            f"{_HINT}."
+        )
+    return image.astype(np.int32)
+
+
+def _boxes(folder: Path, unit: float) -> dict[int, np.ndarray]:
+    """Boxes in metres with y up, by instance + 1, for instances with a valid box."""
+    positions, axes, extents = (
+        read_hdf5(folder / _BOXES.format(name), ("dataset",), _HINT)[0]
+        for name in ("positions", "orientations", "extents")
+    )
+    count = len(positions)
+    if axes.shape != (count, 3, 3) or not positions.shape == extents.shape == (count, 3):
+        raise InputError(f"{folder}: its arrays of 3D boxes do not belong together; {_HINT}.")
+    turn = Y_UP[:3, :3]
+    rows = zip(positions * unit, axes, extents * unit / 2, strict=True)
+    return {
+        k + 1: corners_of(center @ turn.T, (turn @ columns).T, half)
+        for k, (center, columns, half) in enumerate(rows)
+        if np.isfinite([*center, *columns.ravel(), *half]).all() and (half > 0).all()
+    }

@@ -1,0 +1,96 @@
+"""Formats of `--from`: the tools that wrote a room's poses and masks, guessed from its files."""
+
+import contextlib
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from data_prep.readers.posed.coco import CocoMasks
+from data_prep.readers.posed.grounded_sam2 import GroundedSam2, GroundedSam2Images
+from data_prep.readers.posed.id_pngs import IdPngs
+from data_prep.readers.posed.mask_format import MaskFormat
+from data_prep.readers.posed.panoptic import PanopticPngs
+from data_prep.readers.posed.sam2 import ObjectFolders
+from data_prep.readers.posed.transforms import POSES, pose_files
+from sceneprior.core.errors import InputError
+from sceneprior.core.instances.checked import shown
+
+_MASKS: tuple[type[MaskFormat], ...] = (
+    IdPngs, PanopticPngs, ObjectFolders, GroundedSam2, GroundedSam2Images, CocoMasks,
+)  # fmt: skip
+MASKS = tuple(dict.fromkeys(masks.name for masks in _MASKS))
+"""Names of the formats of masks."""
+
+
+def mask_files(folder: Path) -> list[Path]:
+    """The files of a room's masks in all formats."""
+    return sorted({path for masks in _MASKS for path in masks.find(folder)})
+
+
+@dataclass(frozen=True)
+class Formats:
+    """The formats given with `--from`; a format that is None is guessed for each room."""
+
+    poses: str | None = None
+    masks: str | None = None
+
+    def masks_of(self, folder: Path, label_set_name: str) -> MaskFormat:
+        """The masks of a room. If no masks are found, `IdPngs` is returned, whose error message
+        asks the user for PNGs of ids."""
+        return self._mask_format(folder)(folder, label_set_name)
+
+    def _mask_format(self, folder: Path) -> type[MaskFormat]:
+        found = [masks for masks in _MASKS if masks.find(folder)]
+        if self.masks is not None:
+            named = [masks for masks in _MASKS if masks.name == self.masks]
+            chosen = [masks for masks in named if masks in found]
+            if not chosen and self.masks != IdPngs.name:
+                raise InputError(
+                    f"{folder} has no masks of {named[0].title}; leave out --from {self.masks} to "
+                    "guess."
+                )
+            return (chosen or named)[0]
+        if PanopticPngs in found and IdPngs in found:
+            found.remove(IdPngs)
+        if len(found) > 1:
+            raise InputError(
+                f"{folder} has masks of {' and of '.join(masks.title for masks in found)}; choose "
+                f"with --from {' or --from '.join(masks.name for masks in found)}."
+            )
+        return (found or [IdPngs])[0]
+
+    def found(self, rooms: Iterable[Path]) -> list[str]:
+        """Sentences that name the tools of the rooms, if any tool is guessed."""
+        if self.poses and self.masks:
+            return []
+        count: Counter[tuple[str, type[MaskFormat]]] = Counter()
+        for room in rooms:
+            with contextlib.suppress(InputError):  # the report will have the error
+                poses, files = pose_files(room, self.poses)
+                masks = self._mask_format(room)
+                if files:
+                    count[poses, masks] += 1
+        return [
+            f"{number} room{'s' * (number > 1)} with poses of {POSES[poses]} and masks of "
+            f"{masks.title}, as with --from {poses} --from {masks.name}."
+            for (poses, masks), number in count.items()
+        ]
+
+
+def read_formats(names: Iterable[str]) -> Formats:
+    """Parse the values of `--from`: at most one format of poses and one of masks."""
+    given: dict[str, str] = {}
+    for name in names:
+        kind = "poses" if name in POSES else "masks"
+        if name not in POSES and name not in MASKS:
+            raise InputError(
+                f"--from {shown(name)} is not known; choose from {', '.join(POSES)} for poses, and "
+                f"from {', '.join(MASKS)} for masks."
+            )
+        if given.setdefault(kind, name) != name:
+            raise InputError(
+                f"--from {given[kind]} and --from {name} are both formats of {kind}; give one of "
+                "them, and one of the other kind."
+            )
+    return Formats(**given)

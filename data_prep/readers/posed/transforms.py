@@ -1,0 +1,197 @@
+"""Reads a room's poses: nerfstudio-style transforms.json, its split files, or other tools' files.
+
+The keys of a JSON are `frames`, camera keys (see Camera) for all frames, `floor_m`,
+`floor_center_m` and `metres_per_unit`. The keys of a frame are `file_path`, `transform_matrix`,
+`instance_path`, `mask_path`, and camera keys, which override the file's. Other keys are ignored,
+and the pictures themselves are never opened. If the poses come from another tool, only the keys
+about the room are read.
+"""
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+from data_prep.readers.posed.colmap import model_files, read_model
+from data_prep.readers.posed.polycam import polycam_files, read_keyframes
+from data_prep.readers.posed.record3d import read_metadata, record3d_files
+from data_prep.readers.posed.recording import (
+    Camera,
+    Number,
+    PosedFrame,
+    Recording,
+    check_one_png_a_frame,
+    ids_path,
+    path_text,
+)
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import read_json
+from sceneprior.core.instances.checked import checked, number_array, shown
+
+FILE_NAME = "transforms.json"
+
+PathText = Annotated[str, AfterValidator(path_text)]
+
+
+class _FrameEntry(Camera):
+    instance_path: PathText | None = None
+    mask_path: PathText | None = None
+
+
+class _RoomEntry(BaseModel):
+    model_config = ConfigDict(strict=True)
+
+    floor_m: Number | None = None
+    floor_center_m: Annotated[tuple[Number, Number], Field(strict=False)] | None = None
+    metres_per_unit: Annotated[Number, Field(gt=0)] | None = None
+
+
+POSES = {
+    "nerfstudio": f"nerfstudio ({FILE_NAME})",
+    "colmap": "COLMAP (sparse/)",
+    "polycam": "Polycam (keyframes/)",
+    "record3d": "Record3D (metadata)",
+}
+"""Formats of poses: the value of `--from`, and the tool's name with its files."""
+_UP = {"nerfstudio": "z", "colmap": "cameras", "polycam": "y", "record3d": "cameras"}
+_IN_METRES = ("polycam", "record3d")
+
+
+def pose_files(folder: Path, given: str | None = None) -> tuple[str, list[Path]]:
+    """Format of a room's poses, and their files.
+
+    The list is empty if the folder is not a room. If `given` is None, the format is guessed:
+    transforms.json, or else transforms_*.json (one per split), is preferred to a COLMAP model,
+    because nerfstudio writes it beside that model. Poses of other tools may come with a
+    transforms.json that has keys about the room but no frames.
+    """
+    whole = folder / FILE_NAME
+    of_room = [whole] if whole.is_file() else []
+    found = {
+        "colmap": [*(model_files(folder) or ())],
+        "polycam": polycam_files(folder),
+        "record3d": record3d_files(folder),
+    }
+    found = {name: [*files, *of_room] for name, files in found.items() if files}
+    own = of_room or sorted(folder.glob("transforms_*.json"))
+    if own and not (of_room and found and _has_no_frames(whole)):
+        found["nerfstudio"] = own
+        if given != "colmap":
+            found.pop("colmap", None)
+    if given is not None:
+        return given, found.get(given, [])
+    if len(found) > 1:
+        raise InputError(
+            f"{folder} has poses of {' and of '.join(POSES[name] for name in sorted(found))}; "
+            f"choose with --from {' or --from '.join(sorted(found))}."
+        )
+    return next(iter(found.items()), ("nerfstudio", []))
+
+
+def _has_no_frames(whole: Path) -> bool:
+    try:
+        data = read_json(whole)
+    except InputError:
+        return False  # reading it will raise the error
+    return isinstance(data, dict) and "frames" not in data
+
+
+def read_recording(folder: Path, given: str | None = None) -> Recording:
+    """Read the frames of one room (`pose_files`); errors name the file, the frame and the key."""
+    folder = Path(folder)
+    name, files = pose_files(folder, given)
+    if not files and name != "nerfstudio":
+        raise InputError(f"{folder} has no poses of {POSES[name]}; leave out --from to guess.")
+    files = files or [folder / FILE_NAME]
+    jsons = [(path, read_json(path)) for path in files if name == "nerfstudio"]
+    rooms = jsons or [(path, read_json(path)) for path in files if path == folder / FILE_NAME]
+    of_room = [(path, checked(_RoomEntry, data, str(path))) for path, data in rooms]
+    frames: list[PosedFrame] = []
+    for path, data in jsons:
+        frames += _frames(path, data)
+    if name != "nerfstudio":
+        own = [path for path in files if path != folder / FILE_NAME]
+        for picture, pose, camera in _posed(name, own):
+            frames.append(PosedFrame(picture, pose, ids_path(folder, picture), None, camera))
+    check_one_png_a_frame(files[0], tuple(frames))
+    metres_per_unit = _one("metres_per_unit", of_room)
+    return Recording(
+        folder,
+        files[0],
+        tuple(frames),
+        _one("floor_m", of_room),
+        _one("floor_center_m", of_room),
+        1.0 if metres_per_unit is None and name in _IN_METRES else metres_per_unit,
+        _UP[name],
+    )
+
+
+def _posed(name: str, files: list[Path]) -> Iterator[tuple[str, np.ndarray, Camera]]:
+    """Picture, pose and camera of each frame of another tool's files."""
+    if name == "polycam":
+        yield from read_keyframes(files)
+    elif name == "record3d":
+        yield from read_metadata(files[0])
+    else:
+        images = read_model(*files)
+        if not images:
+            raise InputError(f"{files[1]} has no image with a pose.")
+        for image in images:
+            where = f"{files[1]}, image {shown(image.name)}"
+            yield image.name, image.camera_to_world, checked(Camera, image.camera, where)
+
+
+def _one(key: str, rooms: list[tuple[Path, _RoomEntry]]) -> Any:
+    """Value of a key, which all files of a room that have the key must share; None if none has."""
+    said = [(path.name, getattr(room, key)) for path, room in rooms]
+    said = [(name, value) for name, value in said if value is not None]
+    for name, value in said[1:]:
+        if value != said[0][1]:
+            raise InputError(
+                f"{rooms[0][0].parent}: {key} is {said[0][1]} in {said[0][0]}, but {value} in "
+                f"{name}; a room has one."
+            )
+    return said[0][1] if said else None
+
+
+def _frames(path: Path, data: dict[str, Any]) -> list[PosedFrame]:
+    if not isinstance(data.get("frames"), list) or not data["frames"]:
+        raise InputError(f"{path} has no list `frames` with a frame in it.")
+    return [_frame(path, data, number) for number in range(len(data["frames"]))]
+
+
+def _frame(path: Path, data: dict[str, Any], number: int) -> PosedFrame:
+    item = data["frames"][number]
+    if not isinstance(item, dict) or not isinstance(item.get("file_path"), str):
+        raise InputError(f"{path}, frame {number}: it has no `file_path`.")
+    name = item["file_path"]
+    where = f"{path}, frame {shown(name)}"
+    try:
+        ids = ids_path(path.parent, name)
+    except InputError as error:
+        raise InputError(f"{path}, frame {number}: `file_path` {error}") from None
+    own = {key: value for key, value in item.items() if value is not None}
+    of_file = {key: data[key] for key in Camera.model_fields if data.get(key) is not None}
+    entry = checked(_FrameEntry, of_file | own, where)
+    return PosedFrame(
+        name,
+        _matrix(where, item.get("transform_matrix")),
+        path.parent / entry.instance_path if entry.instance_path else ids,
+        path.parent / entry.mask_path if entry.mask_path else None,
+        entry,
+    )
+
+
+def _matrix(where: str, value: Any) -> np.ndarray:
+    """Parse a (4, 4) matrix, which may lack its last row. NaN (a lost pose) is allowed."""
+    matrix = np.zeros(0)
+    with contextlib.suppress(TypeError, ValueError):
+        matrix = number_array(value)
+    if matrix.shape == (3, 4):
+        matrix = np.concatenate([matrix, [[0, 0, 0, 1]]])
+    if matrix.shape != (4, 4):
+        raise InputError(f"{where}: `transform_matrix` is not a list of 4 rows of 4 numbers.")
+    return matrix
