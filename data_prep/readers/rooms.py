@@ -24,8 +24,8 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.geometry.corners import CUBE_CORNERS
 from sceneprior.core.instances.observations import Observations, observe
 from sceneprior.core.instances.tables import IdTable, tidy
+from sceneprior.core.outline import rectangle
 from sceneprior.core.shards import RoomGroundTruth, thinned_stuff
-from sceneprior.core.shell import rectangle
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,14 @@ import shapely
 from jaxtyping import Float
 
 from sceneprior.core.errors import InputError
-from sceneprior.core.floor import floor_rectangle
 from sceneprior.core.geometry.part_meshes import prism, triangles_of
+from sceneprior.core.outline import (
+    Wall,
+    floor_rectangle,
+    rectangle,
+    wall_of_opening,
+    walls_of,
+)
 from sceneprior.core.scene import Mesh, Opening, Scene
 
 ShellName = Literal["walls", "floor", "none"]
@@ -27,28 +33,6 @@ LAMPS_FROM_M = 2.2
 """Height above which the top of a lamp is taken as the height of an unknown ceiling."""
 FLAT_RAD = 1e-3
 """Angle between two sides of the outline below which their corner is left out."""
-
-
-class Wall(NamedTuple):
-    """A wall along one side of the floor's outline, from the side's start to its end."""
-
-    start_m: Float[np.ndarray, "2"]
-    end_m: Float[np.ndarray, "2"]
-    """End (x, z) of the inner face."""
-    outward: Float[np.ndarray, "2"]
-    """Unit normal (x, z) that points out of the room."""
-    openings: tuple[tuple[float, float, float, float], ...]
-    """Doors and windows: start and end along the wall, bottom and top, in metres."""
-
-    @property
-    def length_m(self) -> float:
-        """Length of the inner face."""
-        return float(np.linalg.norm(self.end_m - self.start_m))
-
-    @property
-    def direction(self) -> Float[np.ndarray, "2"]:
-        """Unit vector (x, z) from the start to the end."""
-        return np.asarray((self.end_m - self.start_m) / self.length_m)
 
 
 class Panel(NamedTuple):
@@ -118,7 +102,7 @@ def shell_of(scene: Scene) -> Shell:
         outline = rectangle(*floor_rectangle(scene))
     plain = _corners(outline)
     grown, grown_m = _grown(plain, scene)
-    walls = _walls(grown)
+    walls = walls_of(grown)
     for opening in scene.openings:
         row, span = _place_of(opening, walls)
         walls[row] = walls[row]._replace(openings=(*walls[row].openings, span))
@@ -167,13 +151,6 @@ def ceiling_height(scene: Scene) -> float:
     return float(max(hung.max(initial=0) or HEIGHT_M, others))
 
 
-def rectangle(
-    low: Float[np.ndarray, "2"], high: Float[np.ndarray, "2"]
-) -> Float[np.ndarray, "4 2"]:
-    """Corners (x, z) of an axis-aligned rectangle between two opposite corners."""
-    return np.array([low, (high[0], low[1]), high, (low[0], high[1])])
-
-
 def _corners(outline_m: Float[np.ndarray, "corners 2"]) -> Float[np.ndarray, "some 2"]:
     """The outline in anticlockwise order (x right, z up), without corners on straight sides."""
     polygon = shapely.Polygon(outline_m)
@@ -189,20 +166,12 @@ def _corners(outline_m: Float[np.ndarray, "corners 2"]) -> Float[np.ndarray, "so
     return np.asarray(corners[np.abs(turn) > FLAT_RAD * sharp])
 
 
-def _walls(corners: Float[np.ndarray, "corners 2"]) -> list[Wall]:
-    walls = []
-    for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        x, z = (end - start) / np.linalg.norm(end - start)
-        walls.append(Wall(start, end, np.array([z, -x]), ()))
-    return walls
-
-
 def _grown(
     corners: Float[np.ndarray, "corners 2"], scene: Scene
 ) -> tuple[Float[np.ndarray, "corners 2"], float]:
     """Move the sides of the outline outwards until it contains all furniture; also return the
     largest distance that a side moved."""
-    walls = _walls(corners)
+    walls = walls_of(corners)
     offsets = np.zeros(len(corners))
     here = corners
     for _ in range(4):
@@ -235,11 +204,7 @@ def _push(
     offsets: Float[np.ndarray, " corners"],
 ) -> None:
     """Increase the offsets of the sides nearest to a point outside until they reach it."""
-    ends = np.roll(corners, -1, axis=0)
-    apart = [
-        shapely.LineString(pair).distance(shapely.Point(point))
-        for pair in zip(corners, ends, strict=True)
-    ]
+    apart = [wall.distance_m(point) for wall in walls_of(corners)]
     for row in np.flatnonzero(np.array(apart) <= min(apart) + 1e-9).tolist():
         beyond = float((point - walls[row].start_m) @ walls[row].outward)
         offsets[row] = max(offsets[row], beyond)
@@ -273,16 +238,12 @@ def _place_of(
     opening: Opening, walls: Sequence[Wall]
 ) -> tuple[int, tuple[float, float, float, float]]:
     """Index of the nearest wall parallel to an opening, and the opening as in `Wall.openings`."""
-    start, end = np.array(opening.start_m), np.array(opening.end_m)
-    along = (end - start) / np.linalg.norm(end - start)
-    middle = shapely.Point((start + end) / 2)
-    costs = [
-        shapely.LineString([w.start_m, w.end_m]).distance(middle) + 10 * abs(along @ w.outward)
-        for w in walls
+    row = wall_of_opening(walls, opening)
+    ends = [
+        float((np.array(point) - walls[row].start_m) @ walls[row].direction)
+        for point in (opening.start_m, opening.end_m)
     ]
-    row = int(np.argmin(costs))
-    wall = walls[row]
-    low, high = sorted(float((point - wall.start_m) @ wall.direction) for point in (start, end))
+    low, high = sorted(ends)
     return row, (low, high, opening.bottom_m, opening.top_m)
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from sceneprior.core.colliders import colliders, is_fixed, points_of
 from sceneprior.core.feet import with_feet
-from sceneprior.core.floor import floor_polygon
+from sceneprior.core.outline import free_floor
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 
 GAP_M = 2e-3
@@ -120,7 +120,7 @@ def _on_feet(item: SceneObject, changes: Counter[str]) -> SceneObject:
 
 def _apart(scene: Scene, objects: list[SceneObject], changes: Counter[str]) -> list[SceneObject]:
     """Move objects apart, the largest first; objects without a free place are left out."""
-    floor = _free_floor(scene)
+    floor = free_floor(scene)
     kept: dict[int, SceneObject] = {}
     taken = np.zeros((0, 2, 3))
     order = np.argsort([-item.size_m[0] * item.size_m[2] for item in objects], kind="stable")
@@ -138,16 +138,6 @@ def _apart(scene: Scene, objects: list[SceneObject], changes: Counter[str]) -> l
         kept[row] = item
         taken = np.concatenate([taken, boxes])
     return [kept[row] for row in range(len(objects)) if row in kept]
-
-
-def _free_floor(scene: Scene) -> shapely.Geometry | None:
-    """The floor without the squares into which doors swing; None if the floor is unknown."""
-    floor = floor_polygon(scene)
-    if floor is None:
-        return None
-    doors = [o for o in scene.openings if o.kind == "door"]
-    lines = [shapely.LineString([door.start_m, door.end_m]) for door in doors]
-    return floor - shapely.union_all([line.buffer(line.length, cap_style="flat") for line in lines])
 
 
 def free_offset(

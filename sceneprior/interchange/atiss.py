@@ -10,7 +10,7 @@ import shapely
 
 from sceneprior.core.classes import label_set
 from sceneprior.core.files import write_whole
-from sceneprior.core.floor import floor_polygon
+from sceneprior.core.outline import floor_polygon
 from sceneprior.core.scene import Scene, Turned
 from sceneprior.interchange.box_lists import NOT_FURNITURE
 

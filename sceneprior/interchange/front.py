@@ -16,8 +16,8 @@ import shapely
 
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import json_text, write_json, write_whole
-from sceneprior.core.floor import floor_polygon, floor_rectangle
 from sceneprior.core.furniture import MODEL_FILE, category_table, class_of_category
+from sceneprior.core.outline import floor_polygon, floor_rectangle
 from sceneprior.core.scene import Scene
 from sceneprior.interchange.atiss import floor_plan
 from sceneprior.render.topdown import scene_meshes

@@ -8,11 +8,11 @@ from jaxtyping import UInt8
 
 from sceneprior.core.cameras import Orthographic, Pinhole, look_at
 from sceneprior.core.classes import class_colors, label_set
-from sceneprior.core.floor import floor_rectangle
 from sceneprior.core.geometry.corners import BOX_FACES, box_corners
+from sceneprior.core.outline import floor_rectangle, rectangle
 from sceneprior.core.palette import quiet_colors
 from sceneprior.core.scene import Mesh, Scene, SceneObject
-from sceneprior.core.shell import ShellName, rectangle, shell_of, slab
+from sceneprior.core.shell import ShellName, shell_of, slab
 from sceneprior.render.offscreen import SoftwareRenderer
 from sceneprior.render.pictures import paint_ids
 

@@ -6,8 +6,8 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
-from sceneprior.core.floor import floor_polygon
 from sceneprior.core.geometry.turns import yaw_rotation
+from sceneprior.core.outline import floor_polygon
 from sceneprior.core.scene import Opening, Scene
 from sceneprior.evaluation.metric import USED, Counts, Metric
 from sceneprior.evaluation.surfaces import Triangles, own_box, triangles_of

@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 
 from sceneprior.core.classes import VOID
-from sceneprior.core.floor import floor_polygon
+from sceneprior.core.outline import floor_polygon
 from sceneprior.core.scene import Scene
 from sceneprior.evaluation.bootstrap import Estimate, ratio
 from sceneprior.evaluation.metric import Comparison, Metric, RoomSet, mean_over_rooms

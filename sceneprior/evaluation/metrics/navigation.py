@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Int
 
-from sceneprior.core.floor import floor_polygon
+from sceneprior.core.outline import floor_polygon
 from sceneprior.core.scene import Scene
 from sceneprior.evaluation.metric import USED, Counts, Metric
 from sceneprior.evaluation.surfaces import footprint

@@ -5,10 +5,9 @@ import shapely
 from jaxtyping import Bool, Float
 
 from sceneprior.core.colliders import support_of
-from sceneprior.core.floor import floor_rectangle
 from sceneprior.core.geometry.turns import yaw_rotation
+from sceneprior.core.outline import floor_rectangle, rectangle
 from sceneprior.core.scene import Scene, SceneObject
-from sceneprior.core.shell import rectangle
 from sceneprior.evaluation.metric import USED, Counts, Metric
 from sceneprior.evaluation.surfaces import (
     Points,

@@ -6,7 +6,7 @@ import numpy as np
 import shapely
 from jaxtyping import Bool, Int
 
-from sceneprior.core.floor import floor_polygon
+from sceneprior.core.outline import floor_polygon
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.shell import ceiling_height
 from sceneprior.evaluation.metric import USED, Counts, Metric

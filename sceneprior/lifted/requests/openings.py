@@ -10,9 +10,10 @@ import shapely
 from jaxtyping import Float
 
 from sceneprior.core.errors import InputError
+from sceneprior.core.outline import Wall, space_before, wall_of_opening, walls_of
 from sceneprior.core.scene import Opening
 from sceneprior.core.scene_json import check_openings
-from sceneprior.lifted.requests.shape import RoomShape, Side, sides_of
+from sceneprior.lifted.requests.shape import RoomShape
 
 DOOR_M = (0.9, 0.0, 2.0)
 """Default width, lower edge and upper edge of a door."""
@@ -115,7 +116,7 @@ def place_openings(
     Raises:
         InputError: an opening lies on no side of the floor, or there is no free wall for it.
     """
-    sides = sides_of(outline_m)
+    sides = walls_of(outline_m)
     placed = [each for each in wanted if isinstance(each, Opening)]
     check_openings("The request", outline_m, placed)
     for each in sorted(
@@ -127,10 +128,10 @@ def place_openings(
 
 
 def _placed(
-    wanted: WantedOpening, sides: list[Side], there: list[Opening], draws: np.random.Generator
+    wanted: WantedOpening, sides: list[Wall], there: list[Opening], draws: np.random.Generator
 ) -> Opening:
     width_m, bottom_m, top_m = DOOR_M if wanted.kind == "door" else WINDOW_M
-    choice = walls_of(wanted, sides)
+    choice = walls_for(wanted, sides)
     room_m = np.array([max(side.length_m - width_m - 2 * MARGIN_M, 0.0) for side in choice])
     taken = [shapely.LineString([each.start_m, each.end_m]) for each in there]
     where = f"on {wanted.wall} " if wanted.wall is not None else ""
@@ -148,7 +149,7 @@ def _placed(
             at_m = width_m / 2 + MARGIN_M + room_m[row] * draws.random()
         else:
             break
-        first, last = (side.start_m + side.along * (at_m + s * width_m / 2) for s in (-1, 1))
+        first, last = (side.start_m + side.direction * (at_m + s * width_m / 2) for s in (-1, 1))
         line = shapely.LineString([first, last])
         if all(line.distance(other) >= MARGIN_M for other in taken):
             return Opening(wanted.kind, _pair(first), _pair(last), bottom_m, top_m)
@@ -160,7 +161,7 @@ def _placed(
     )
 
 
-def walls_of(wanted: WantedOpening, sides: list[Side]) -> list[Side]:
+def walls_for(wanted: WantedOpening, sides: list[Wall]) -> list[Wall]:
     """Sides on which an opening may lie. Walls of `COMPASS` run from west to east or from north to
     south."""
     if wanted.wall is None:
@@ -173,12 +174,12 @@ def walls_of(wanted: WantedOpening, sides: list[Side]) -> list[Side]:
             )
         return [sides[wanted.wall]]
     outwards = np.array(COMPASS[wanted.wall])
-    facing = [side for side in sides if -side.inward @ outwards > np.cos(np.pi / 4) - 1e-6]
+    facing = [side for side in sides if side.outward @ outwards > np.cos(np.pi / 4) - 1e-6]
     if not facing:
         raise InputError(f"The floor has no wall in the {wanted.wall}; name it by its number.")
     longest = max(facing, key=lambda side: side.length_m)
     backwards = (longest.end_m - longest.start_m).sum() < 0
-    return [Side(longest.end_m, longest.start_m, longest.inward) if backwards else longest]
+    return [Wall(longest.end_m, longest.start_m, longest.outward) if backwards else longest]
 
 
 def _pair(point: Float[np.ndarray, "2"]) -> tuple[float, float]:
@@ -199,10 +200,9 @@ def zones_of(shape: RoomShape) -> dict[str, list[Zone]]:
     zones: dict[str, list[Zone]] = {"door": [], "window": []}
     for each in shape.openings:
         start, end = np.array(each.start_m), np.array(each.end_m)
-        depth = np.linalg.norm(end - start) if each.kind == "door" else BEFORE_WINDOW_M
-        into = depth * inward_of(shape, each)
+        depth_m = float(np.linalg.norm(end - start)) if each.kind == "door" else BEFORE_WINDOW_M
         # 1 cm smaller on all sides, so that furniture may touch the zone.
-        polygon = shapely.Polygon([start, end, end + into, start + into]).buffer(-0.01)
+        polygon = space_before(each, inward_of(shape, each), depth_m).buffer(-0.01)
         low_m = 0.0 if each.kind == "door" else each.bottom_m
         zones[each.kind].append(Zone(polygon, low_m, each.top_m))
     return zones
@@ -210,7 +210,5 @@ def zones_of(shape: RoomShape) -> dict[str, list[Zone]]:
 
 def inward_of(shape: RoomShape, opening: Opening) -> Float[np.ndarray, "2"]:
     """Unit normal, into the room, of the wall with this door or window."""
-    middle = shapely.Point(np.mean([opening.start_m, opening.end_m], axis=0))
-    sides = sides_of(shape.outline_m)
-    lines = [shapely.LineString([side.start_m, side.end_m]) for side in sides]
-    return sides[int(np.argmin(shapely.distance(lines, middle)))].inward
+    walls = walls_of(shape.outline_m)
+    return walls[wall_of_opening(walls, opening)].inward

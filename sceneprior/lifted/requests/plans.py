@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from sceneprior.core.errors import InputError, InputWarning
-from sceneprior.core.shell import rectangle
+from sceneprior.core.outline import rectangle
 from sceneprior.lifted.requests.contents import draw_contents, required_rows
 from sceneprior.lifted.requests.openings import place_openings
 from sceneprior.lifted.requests.request import Request

@@ -27,9 +27,10 @@ import numpy as np
 import shapely
 from jaxtyping import Bool, Float, Int
 
+from sceneprior.core.outline import walls_of
 from sceneprior.core.scene import Opening
 from sceneprior.lifted.requests.openings import inward_of
-from sceneprior.lifted.requests.shape import RoomShape, sides_of
+from sceneprior.lifted.requests.shape import RoomShape
 
 TO_ROOM = ("at a wall", "in a corner")
 """Relations to the room, which have no target."""
@@ -151,10 +152,10 @@ def footprints(boxes_m: Float[np.ndarray, "boxes 6"]) -> np.ndarray:
 
 def _convex_corners(outline_m: Float[np.ndarray, "corners 2"]) -> Float[np.ndarray, "some 2"]:
     """Corners of a floor with an interior angle below 150 degrees."""
-    sides = sides_of(outline_m)
+    sides = walls_of(outline_m)
     kept = []
     for before, side in zip([sides[-1], *sides], sides, strict=False):
-        turning = before.along @ side.along < np.cos(np.pi / 6)
-        if turning and side.along @ before.inward > 0:
+        turning = before.direction @ side.direction < np.cos(np.pi / 6)
+        if turning and side.direction @ before.inward > 0:
             kept.append(side.start_m)
     return np.array(kept).reshape(-1, 2)

@@ -3,16 +3,16 @@
 import re
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import shapely
 from jaxtyping import Float
 
 from sceneprior.core.errors import InputError
+from sceneprior.core.outline import rectangle
 from sceneprior.core.scene import Opening
 from sceneprior.core.scene_json import check_floor, unit_guess
-from sceneprior.core.shell import rectangle
 
 NARROWEST_M = 0.3
 """Minimum side of a rectangle in which furniture is placed."""
@@ -77,36 +77,6 @@ class RoomShape:
         drawn given these extents."""
         extents_m = self.rectangle_m[2:]
         return np.asarray(extents_m * np.sqrt(self.polygon.area / extents_m.prod()))
-
-
-class Side(NamedTuple):
-    """A side of a floor."""
-
-    start_m: Float[np.ndarray, "2"]
-    end_m: Float[np.ndarray, "2"]
-    inward: Float[np.ndarray, "2"]
-    """Unit normal towards the room."""
-
-    @property
-    def length_m(self) -> float:
-        """Length of the side."""
-        return float(np.linalg.norm(self.end_m - self.start_m))
-
-    @property
-    def along(self) -> Float[np.ndarray, "2"]:
-        """Unit vector from the start to the end."""
-        return np.asarray((self.end_m - self.start_m) / max(self.length_m, 1e-9))
-
-
-def sides_of(outline_m: Float[np.ndarray, "corners 2"]) -> list[Side]:
-    """The sides of an outline, in order: the first leads from corner 0 to corner 1."""
-    following = np.roll(outline_m, -1, axis=0)
-    x, z = outline_m.T
-    area = (x * following[:, 1] - following[:, 0] * z).sum()
-    away = following - outline_m
-    along = away / np.linalg.norm(away, axis=1, keepdims=True).clip(min=1e-9)
-    inward = along[:, ::-1] * [-1, 1] * np.sign(area)
-    return [Side(*side) for side in zip(outline_m, following, inward, strict=True)]
 
 
 def read_floor(floor: str | Sequence[Any] | np.ndarray) -> np.ndarray:

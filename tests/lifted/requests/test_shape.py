@@ -5,7 +5,8 @@ import pytest
 import shapely
 
 from sceneprior.core.errors import InputError
-from sceneprior.lifted.requests.shape import RoomShape, read_floor, sides_of
+from sceneprior.core.outline import walls_of
+from sceneprior.lifted.requests.shape import RoomShape, read_floor
 
 L_SHAPE = [[0, 0], [5, 0], [5, 3], [2, 3], [2, 6], [0, 6]]
 SLANTED = [[0, 0], [4, 0], [5, 3], [2, 4], [0, 3]]
@@ -80,6 +81,6 @@ def test_the_area_sets_the_size_that_contents_are_drawn_by():
 def test_sides_point_into_the_room(floor):
     outline = read_floor(floor)
     polygon = shapely.Polygon(outline)
-    for side in sides_of(outline):
+    for side in walls_of(outline):
         middle = (side.start_m + side.end_m) / 2
         assert polygon.contains(shapely.Point(middle + 0.01 * side.inward))
