@@ -21,6 +21,7 @@ import scipy.stats  # noqa: F401
 import sklearn.linear_model  # noqa: F401
 import torch
 from browser import browser  # noqa: F401 (a fixture)
+from kept_runs import LIFTED, add_lifted, take_lifted, write_kept_run
 from threadpoolctl import threadpool_limits
 from tiny_runs import tiny_config, tiny_lifted, tiny_sampler_config
 from toy_rooms import write_toy_shards
@@ -58,8 +59,15 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
 
 @pytest.fixture(scope="session")
 def toy_shards(made_once: Callable[..., Path]) -> Path:
-    """12 training and 4 test rooms of boxes, 8 views each. Tests read it and change nothing."""
-    return made_once("shards", write_toy_shards)
+    """12 training and 4 test rooms of boxes, 8 views each, and what was lifted from their masks.
+    Tests read it and change nothing."""
+
+    def make(folder: Path) -> None:
+        write_toy_shards(folder)
+        if LIFTED.exists():
+            add_lifted(folder)
+
+    return made_once("shards", make)
 
 
 @pytest.fixture
@@ -101,10 +109,8 @@ def torch_rng() -> torch.Generator:
 @pytest.fixture(scope="session")
 def toy_run(toy_shards: Path, made_once: Callable[..., Path]) -> Path:
     """A run with both stages, trained on the toy rooms for a few epochs. Tests only read it."""
-    from sceneprior.training.fit import fit
-
     config = tiny_config(toy_shards, layout__epochs=20)
-    return made_once("run", lambda run: fit(config, run, trainer_options={"accelerator": "cpu"}))
+    return made_once("run", lambda run: write_kept_run("paper", config, run))
 
 
 @pytest.fixture(scope="session")
@@ -129,13 +135,14 @@ def renderer() -> Renderer:
 
 @pytest.fixture(scope="session")
 def sampler_run(toy_shards: Path, made_once: Callable[..., Path]) -> Path:
-    """A prior of occupancy grids and its sampler, hardly trained. Tests read it only."""
-    from sceneprior.training.fit import fit
+    """A prior of furniture in parts and its sampler, hardly trained. Tests read it only."""
 
-    config = tiny_sampler_config(toy_shards)
-    return made_once(
-        "sampled", lambda run: fit(config, run, trainer_options={"accelerator": "cpu"})
-    )
+    def make(run: Path) -> None:
+        write_kept_run("sampler", tiny_sampler_config(toy_shards), run)
+        if os.environ.get("TAKE_RUNS"):
+            take_lifted(toy_shards)
+
+    return made_once("sampled", make)
 
 
 @pytest.fixture

@@ -41,21 +41,33 @@ def curve(run: Path, stage: str, name: str = "train/loss") -> list[float]:
         return [float(row[name]) for row in csv.DictReader(file) if row.get(name)]
 
 
-def test_both_stages_learn_and_leave_what_runs_py_promises(toy_run, toy_shards):
-    files = {str(path.relative_to(toy_run)) for path in toy_run.rglob("*") if path.is_file()}
+@pytest.fixture(scope="module")
+def trained_run(toy_shards, tmp_path_factory) -> Path:
+    """The run `toy_run`, trained here."""
+    run = tmp_path_factory.mktemp("trained") / "run"
+    fit(tiny_config(toy_shards, layout__epochs=20), run, trainer_options=CPU)
+    return run
+
+
+def test_both_stages_learn_and_leave_what_runs_py_promises(trained_run, toy_shards):
+    files = {
+        str(path.relative_to(trained_run)) for path in trained_run.rglob("*") if path.is_file()
+    }
     for stage in ("layout", "shape"):
         assert {f"{stage}/final.ckpt", f"{stage}/metrics.csv"} <= files
         assert any(name.startswith(f"{stage}/events.out.tfevents") for name in files)
     assert "layout/last.ckpt" in files
     assert not [name for name in files if name.endswith(".part")]
-    assert load_config(str(toy_run / "config.yaml")) == tiny_config(toy_shards, layout__epochs=20)
-    layout, shape = curve(toy_run, "layout"), curve(toy_run, "shape")
+    assert load_config(str(trained_run / "config.yaml")) == tiny_config(
+        toy_shards, layout__epochs=20
+    )
+    layout, shape = curve(trained_run, "layout"), curve(trained_run, "shape")
     assert (len(layout), len(shape)) == (20, 3)
     assert layout[-1] < 0.75 * layout[0] and np.isfinite(layout + shape).all()
     for name in ("class", "box", "completeness", "frustum", "mask", "mask_iou", "mask_used"):
-        values = curve(toy_run, "shape", f"train/{name}")
+        values = curve(trained_run, "shape", f"train/{name}")
         assert len(values) == 3, name
-    assert 0 < curve(toy_run, "shape", "train/mask_iou")[-1] < 1
+    assert 0 < curve(trained_run, "shape", "train/mask_iou")[-1] < 1
 
 
 def test_resuming_a_finished_run_trains_nothing(toy_run, toy_shards, tmp_path, monkeypatch):

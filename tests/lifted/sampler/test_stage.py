@@ -106,9 +106,7 @@ def test_a_run_ends_with_a_sampler(sampler_run):
     assert len(trained.room_ids) == len(trained.logits) == 12
 
 
-def test_a_resumed_run_ends_as_one_that_was_never_stopped(
-    sampler_run, toy_shards, tmp_path, monkeypatch
-):
+def test_a_resumed_run_ends_as_one_that_was_never_stopped(toy_shards, tmp_path, monkeypatch):
     class StopError(Exception):
         pass
 
@@ -117,13 +115,16 @@ def test_a_resumed_run_ends_as_one_that_was_never_stopped(
             if self.current_epoch == 2:
                 raise StopError
 
-    whole, again = load_any_run(sampler_run), tmp_path / "run"
+    whole, again = tmp_path / "whole", tmp_path / "run"
+    fit(tiny_sampler_config(toy_shards), whole, trainer_options=CPU)
     with monkeypatch.context() as patch, pytest.raises(StopError):
         patch.setattr("sceneprior.lifted.sampler.stage.SamplerStage", Stopped)
         fit(tiny_sampler_config(toy_shards), again, trainer_options=CPU)
     fit(tiny_sampler_config(toy_shards), again, resume=True, trainer_options=CPU)
     for one, other in zip(
-        whole.sampler.parameters(), load_any_run(again).sampler.parameters(), strict=True
+        load_any_run(whole).sampler.parameters(),
+        load_any_run(again).sampler.parameters(),
+        strict=True,
     ):
         assert torch.equal(one, other)
 
