@@ -1,7 +1,6 @@
 """Helpers for tests of commands: sentences on the error stream, and unchanged folders."""
 
 from pathlib import Path
-from typing import Any
 
 from refusals import refused
 from typer.testing import CliRunner
@@ -10,11 +9,11 @@ from sceneprior.apps.cli.commands import app
 from sceneprior.core.errors import InputError
 
 
-def call_here(runner: Any, arguments: list[str], log: Path) -> tuple[int, dict[str, float]]:
-    """Stands in for `StepRunner.call`, which test_steps.py tests: the command in this process."""
+def call_here(arguments: list[str], log: Path) -> tuple[int, dict[str, float], bool]:
+    """Stands in for `commands.call`, which test_commands.py tests: the command in this process."""
     done = CliRunner().invoke(app, arguments)
     log.write_text(done.output)
-    return done.exit_code, {"cpu_s": 2.5, "wall_s": 3.0, "peak_memory_gib": 0.5}
+    return done.exit_code, {"cpu_s": 2.5, "wall_s": 3.0, "peak_memory_gib": 0.5}, False
 
 
 def one_sentence(result: tuple[int, str, str]) -> str:

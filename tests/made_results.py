@@ -1,4 +1,4 @@
-"""Comparisons of tiny configs, and result files as `eval-fid` and `eval-svr` write them, made up."""
+"""Comparisons of tiny configs, with made-up result files of `eval-fid` and `eval-svr`."""
 
 from pathlib import Path
 from typing import Any

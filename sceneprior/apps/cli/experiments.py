@@ -33,15 +33,14 @@ def compare(
     accelerator: AcceleratorOption = "auto",
 ) -> None:
     """Train and evaluate methods on the same rooms, and tabulate them; run again to continue."""
-    from sceneprior.apps.experiments.compare import CompareOptions
     from sceneprior.apps.experiments.compare import compare as run_comparison
-    from sceneprior.apps.experiments.comparison import load_comparison, part_of
+    from sceneprior.apps.experiments.comparison import part_of
+    from sceneprior.apps.experiments.runs import load_comparison
 
     comparison = load_comparison(config)
     part = part_of(comparison, methods, rooms, seeds)
     with _stopped_by_ctrl_c():
-        options = CompareOptions(inception, accelerator)
-        done = run_comparison(comparison, part, out, options)
+        done = run_comparison(comparison, part, out, inception, accelerator)
     if done.table is not None:
         typer.echo(f"Wrote {done.table}")
     if done.left_out:

@@ -5,24 +5,17 @@ alone. Finished commands are not repeated.
 """
 
 import hashlib
-from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 from sceneprior.apps.config import load_config
-from sceneprior.apps.experiments.comparison import (
-    Comparison,
-    RoomComparison,
-    Run,
-    ViewComparison,
-    runs_of,
-    shards_of,
-    variants_of,
-)
-from sceneprior.apps.experiments.rows import rows_of
-from sceneprior.apps.experiments.steps import Step, StepRunner, is_done, open_runner
-from sceneprior.apps.experiments.table import NEW_ROOMS, VIEWS, write_tables
+from sceneprior.apps.experiments.commands import Command, is_done, run_command
+from sceneprior.apps.experiments.comparison import Comparison, RoomComparison, ViewComparison
+from sceneprior.apps.experiments.runs import Run, runs_of, shards_of, variants_of
+from sceneprior.apps.experiments.table import write_tables
 from sceneprior.core.errors import InputError
+from sceneprior.core.files import only_writer
 from sceneprior.core.ground_truth import known_in_3d
 from sceneprior.core.shards import iterate_rooms
 from sceneprior.evaluation.networks import check_inception
@@ -31,18 +24,7 @@ OF_SHARDS = "shards"
 """Value of `cad_models` that selects the CAD models of the training rooms."""
 
 
-@dataclass(frozen=True)
-class CompareOptions:
-    """Options for training and evaluating all runs of a comparison."""
-
-    inception: Path | None = None
-    """NVIDIA's `inception-2015-12-05.pt`; None leaves FID out."""
-    accelerator: str = "auto"
-    """Lightning's name of the accelerator; each run is trained on one device."""
-
-
-@dataclass(frozen=True)
-class Compared:
+class Compared(NamedTuple):
     """Outcome of a call of `compare`."""
 
     table: Path | None
@@ -55,52 +37,75 @@ class Compared:
 
 
 def compare(
-    comparison: Comparison, part: Comparison, out: Path, options: CompareOptions
+    comparison: Comparison,
+    part: Comparison,
+    out: Path,
+    inception: Path | None = None,
+    accelerator: str = "auto",
 ) -> Compared:
     """Finish the runs of `part`, then write the tables of all finished runs.
 
     The folder of a run is `<out>/<rooms>/<method>/seed<k>/`; tables are written to `out`. Ctrl-C,
     SIGTERM and SIGHUP raise KeyboardInterrupt; a second, identical call continues.
+
+    Args:
+        inception: NVIDIA's `inception-2015-12-05.pt`; None leaves FID out.
+        accelerator: Lightning's name of the accelerator; each run is trained on one device.
     """
-    if options.inception is not None:
-        check_inception(options.inception)
-    count = cache(partial(count_of, comparison))
+    if inception is not None:
+        check_inception(inception)
+    count = cache(lambda rooms: count_of(comparison, rooms))
     for rooms in part.rooms:
         count(rooms)  # unusable shards raise here, before anything is trained
-    asked, done, failures, left_out = runs_of(part, out), [], [], []
-    with open_runner(out) as runner:
+    asked, done, failures, left_out = runs_of(part, out), list[Run](), list[str](), list[str]()
+    with only_writer(out):
         for run in runs_of(comparison, out):
-            if run not in asked and not (run.folder / "scores.json").is_file():
+            evaluated = (run.folder / "scores.json").is_file()
+            if run not in asked and not evaluated:
                 continue
-            steps = steps_of(comparison, run, count(run.rooms), options)
-            if run in asked and (failure := _do(runner, run, steps)):
+            commands = commands_of(comparison, run, count(run.rooms), inception, accelerator)
+            if run in asked and (failure := _finish(run, commands)):
                 failures.append(f"{run.title}: {failure}")
-            elif keeps_settings(run) and all(is_done(step, run.folder) for step in steps):
+            elif keeps_settings(run) and all(is_done(each, run.folder) for each in commands):
                 done.append(run)
-            elif (run.folder / "scores.json").is_file():
+            elif evaluated:
                 left_out.append(run.title)
         if done:
-            form = VIEWS if isinstance(comparison, ViewComparison) else NEW_ROOMS
-            write_tables([row for run in done for row in rows_of(comparison, run)], out, form)
+            write_tables(comparison, done, out)
     return Compared(out / "table.md" if done else None, failures, left_out)
 
 
-def _do(runner: StepRunner, run: Run, steps: list[Step]) -> str | None:
-    """Run the unfinished steps of a run; returns a sentence if one fails, else None."""
+def _finish(run: Run, commands: list[Command]) -> str | None:
+    """Run the unfinished commands of a run; returns a sentence if one fails, else None."""
+    if not keeps_settings(run):
+        return (
+            f"{run.folder} holds a run with other settings than those of the comparison; "
+            "delete it to train again, or name another --out."
+        )
     try:
-        if not keeps_settings(run):
-            raise InputError(
-                f"{run.folder} holds a run with other settings than those of the comparison; "
-                "delete it to train again, or name another --out."
-            )
-        for step in steps:
-            if not is_done(step, run.folder):
-                runner.do(step, run.folder, run.folder / f"{step.name}.log")
+        for command in commands:
+            if not is_done(command, run.folder):
+                run_command(command, run.folder, run.folder / f"{command.name}.log")
     except InputError as error:
         return str(error)
-    except OSError as error:
-        return f"{error.filename or run.folder} cannot be written ({error.strerror})"
     return None
+
+
+def keeps_settings(run: Run) -> bool:
+    """True if a run's folder is free, or holds a run that was trained with the run's settings.
+
+    The section `sampling` is not compared: it has no effect on training, and rows name the
+    distribution.
+    """
+    saved = run.folder / "run" / "config.yaml"
+    if not saved.is_file():
+        return True
+    wanted = run.run_config.with_label_set()
+    try:
+        kept = load_config(str(saved))
+    except InputError:
+        return False  # written by another version, or damaged
+    return kept.model_dump(exclude={"sampling"}) == wanted.model_dump(exclude={"sampling"})
 
 
 def count_of(comparison: Comparison, rooms: str) -> int | None:
@@ -121,78 +126,51 @@ def count_of(comparison: Comparison, rooms: str) -> int | None:
     return comparison.count or sum(1 for _ in iterate_rooms(shards, "train"))
 
 
-def steps_of(
-    comparison: Comparison, run: Run, count: int | None, options: CompareOptions
-) -> list[Step]:
-    """The commands of a run: `fit`, unless the run is a folder of scenes, and its scoring steps."""
-    scoring = scoring_steps(comparison, run, count, options)
-    if run.scenes is not None:
-        return scoring
-    folder = run.folder / "run"
-    settings = [word for setting in run.settings for word in ("--set", setting)]
-    last = run.run_config.stage_names[-1]
-    # One device, because several would split each batch, or train on larger batches.
-    device = ["--accelerator", options.accelerator, "--devices", "1"]
-    words = ["fit", "--config", run.config, "--run", str(folder), *settings, "--logger", "csv"]
-    fit = Step(
-        "fit",
-        [*words, *device, "--resume"],
-        result=folder / last / "final.ckpt",
-        depends_on=[],  # changed settings never repeat `fit`: `keeps_settings` refuses the run
-        continues=folder / "config.yaml",
-    )
-    return [fit, *scoring]
-
-
-def keeps_settings(run: Run) -> bool:
-    """True if a run's folder is free, or holds a run that was trained with the run's settings.
-
-    The section `sampling` is not compared: it has no effect on training, and rows name the
-    distribution.
-    """
-    saved = run.folder / "run" / "config.yaml"
-    if not saved.is_file():
-        return True
-    wanted = run.run_config.with_label_set()
-    try:
-        kept = load_config(str(saved))
-    except InputError:
-        return False  # written by another version, or damaged
-    return kept.model_dump(exclude={"sampling"}) == wanted.model_dump(exclude={"sampling"})
-
-
-def scoring_steps(
-    comparison: Comparison, run: Run, count: int | None, options: CompareOptions
-) -> list[Step]:
-    """`eval-fid` or `eval-svr` of a run, once for each of the run's variants.
-
-    These steps depend on the settings that all rows of a table share.
-    """
-    shards, state = str(shards_of(comparison, run.rooms)), []
+def commands_of(
+    comparison: Comparison,
+    run: Run,
+    count: int | None,
+    inception: Path | None = None,
+    accelerator: str = "auto",
+) -> list[Command]:
+    """The commands of a run: `fit`, unless it is a folder of scenes, and for each of its variants
+    `eval-fid` or `eval-svr`, which depends on the settings that all rows of a table share."""
+    shards, state = str(shards_of(comparison, run.rooms)), list[str]()
     source = ["--run", str(run.folder / "run")]
-    seed = ["--seed", str(comparison.sampling_seed)]
+    shared = ["--seed", str(comparison.sampling_seed)]
     if isinstance(comparison, ViewComparison):
         command, option = "eval-svr", "--fit"
         source += ["--shards", shards]
-        alike = ["--split", "test", "--views", str(comparison.views), *seed]
+        shared = ["--split", "test", "--views", str(comparison.views), *shared]
         if count is not None:
-            alike += ["--limit", str(count)]
+            shared += ["--limit", str(count)]
         if (models := comparison.cad_models) is not None:
-            alike += ["--models", shards if models == OF_SHARDS else models]
+            shared += ["--models", shards if models == OF_SHARDS else models]
     else:
         command, option = "eval-fid", "--distribution"
         if run.scenes is not None:
             source, state = ["--scenes", str(run.scenes), "--shards", shards], [_state(run.scenes)]
         # Some methods decode meshes, others boxes only; --boxes compares the boxes of all methods.
-        alike = ["-n", str(count), *seed, "--boxes"]
-        if options.inception is not None:
-            alike += ["--inception", str(options.inception)]
-    steps = []
+        shared = ["-n", str(count), *shared, "--boxes"]
+        if inception is not None:
+            shared += ["--inception", str(inception)]
+    commands = [] if run.scenes is not None else [_fit(run, accelerator)]
     for variant in variants_of(comparison, run):
-        asked = alike if variant.name is None else [*alike, option, variant.name]
+        asked = shared if variant.name is None else [*shared, option, variant.name]
         words = [command, *source, "--out", str(variant.result), *asked]
-        steps.append(Step(variant.result.stem, words, variant.result, depends_on=asked + state))
-    return steps
+        commands.append(Command(variant.result.stem, words, variant.result, asked + state))
+    return commands
+
+
+def _fit(run: Run, accelerator: str) -> Command:
+    folder = run.folder / "run"
+    settings = [word for setting in run.settings for word in ("--set", setting)]
+    words = ["fit", "--config", run.config, "--run", str(folder), *settings, "--logger", "csv"]
+    # One device, because several would split each batch, or train on larger batches.
+    words += ["--accelerator", accelerator, "--devices", "1", "--resume"]
+    result = folder / run.run_config.stage_names[-1] / "final.ckpt"
+    # It depends on nothing, because changed settings never repeat it: `keeps_settings` refuses.
+    return Command("fit", words, result, depends_on=[], continues=folder / "config.yaml")
 
 
 def _state(scenes: Path) -> str:

@@ -1,6 +1,6 @@
 """The whole pipeline on procedural homes: homes, shards, training, new rooms, scores, a page.
 
-Each step is a `sceneprior` command, so the commands on the page are the ones that ran.
+The commands on the page are those that ran.
 """
 
 import shlex
@@ -8,44 +8,50 @@ import sys
 from pathlib import Path
 
 from sceneprior.apps.config import load_config
-from sceneprior.apps.experiments.steps import Step, is_done, open_runner, read_journal, read_result
+from sceneprior.apps.experiments.commands import (
+    Command,
+    is_done,
+    read_journal,
+    read_result,
+    run_command,
+)
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import write_json
+from sceneprior.core.files import only_writer, write_json
 
 
 def run_demo(out: Path, config: str, rooms: int, count: int) -> None:
-    """Run every unfinished step, then add time and memory to the scores.
+    """Run every unfinished command, then add time and memory to the scores.
 
     Ctrl-C, SIGTERM and SIGHUP raise KeyboardInterrupt; a second, identical call continues.
     """
-    steps = demo_steps(out, config, rooms, count)
-    with open_runner(out) as runner:
-        for step in steps:
-            if is_done(step, out):
-                took = read_journal(out)[step.name]["wall_s"]
+    commands = demo_commands(out, config, rooms, count)
+    with only_writer(out):
+        for command in commands:
+            if is_done(command, out):
+                took = read_journal(out)[command.name]["wall_s"]
                 seconds = "" if took is None else f", {took:.0f} s"
-                print(f"{step.name}: done before{seconds}", file=sys.stderr)
+                print(f"{command.name}: done before{seconds}", file=sys.stderr)
                 continue
             told: list[str] = []
-            if step.name == "report":
+            if command.name == "report":
                 _add_costs(out)
-                for earlier in steps[:-1]:
+                for earlier in commands[:-1]:
                     told += ["--command", f"sceneprior {shlex.join(earlier.arguments)}"]
             try:
-                runner.do(step, out, unshown=told)
+                run_command(command, out, unshown=told)
             except InputError:
                 raise InputError(
-                    f"The demo stopped at '{step.name}'; fix the error and run it again."
+                    f"The demo stopped at '{command.name}'; fix the error and run it again."
                 ) from None
         _add_costs(out)
 
 
-def demo_steps(out: Path, config: str, rooms: int, count: int) -> list[Step]:
+def demo_commands(out: Path, config: str, rooms: int, count: int) -> list[Command]:
     """The demo's commands in order; a command is repeated if its arguments or the contents of
     `config` change."""
     homes, shards, run, scenes = (str(out / name) for name in ("homes", "shards", "run", "scenes"))
     scores, page = str(out / "scores.json"), str(out / "report.html")
-    commands = {
+    words = {
         "homes": ["make-homes", homes, "--rooms", str(rooms), "--seed", "0"],
         "shards": [
             "prep-front", "--front", f"{homes}/3D-FRONT", "--future", f"{homes}/3D-FUTURE-model",
@@ -66,15 +72,15 @@ def demo_steps(out: Path, config: str, rooms: int, count: int) -> list[Step]:
         "scenes": "scenes/overview.png", "scores": "scores.json", "report": "report.html",
     }  # fmt: skip
     continues = {"shards": out / "shards", "fit": out / "run"}
-    depends_on = commands | {"fit": [*commands["fit"], settings.model_dump_json()]}
+    depends_on = words | {"fit": [*words["fit"], settings.model_dump_json()]}
     return [
-        Step(name, words, out / results[name], depends_on[name], continues.get(name))
-        for name, words in commands.items()
+        Command(name, arguments, out / results[name], depends_on[name], continues.get(name))
+        for name, arguments in words.items()
     ]
 
 
 def _add_costs(out: Path) -> None:
-    """Add the time and memory of all steps to scores.json, unless a step was killed."""
+    """Add the time and memory of all commands to scores.json, unless one was killed."""
     noted = {name: entry for name, entry in read_journal(out).items() if entry.get("finished")}
     scores = read_result(out / "scores.json")
     seconds = {name: entry["wall_s"] for name, entry in noted.items()}

@@ -13,7 +13,7 @@ from sceneprior.apps.experiments.evaluate_views import (
     known_from_views_alone,
     mask_scores,
 )
-from sceneprior.apps.experiments.makers import GIVEN, maker_of_rooms
+from sceneprior.apps.experiments.runs import GIVEN, generated_by
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import write_json
@@ -173,8 +173,8 @@ def report_run(
         if known_in_3d(shards, "train"):
             decoded = decoded_and_true(trained, shards, meshes=True)
         unfolding = unfold(trained)
-    maker = maker_of_rooms(config, trained.distribution).title or f"the method {config.method}"
-    made_by = f"{maker}, which learns from {config.learns_from}"
+    method = generated_by(config, trained.distribution)[0] or f"the method {config.method}"
+    made_by = f"{method}, which learns from {config.learns_from}"
     if isinstance(trained, TrainedPrior):
         made_by += f"; rooms drawn by: {marked(trained.distribution)}"
     write_report(
@@ -207,7 +207,7 @@ def report_folder(
         out,
         title="Rooms beside real ones",
         source=f"scenes {folder.resolve().name}",
-        made_by=GIVEN.said,
+        made_by=GIVEN,
         shards=shards,
         generated=scenes[:ROOMS_SHOWN],
         scores=read_scores(scores, folder, shards, f"--scenes {folder} --shards {shards}"),

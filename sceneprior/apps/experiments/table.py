@@ -1,19 +1,39 @@
-"""The tables of a comparison, as Markdown and CSV, from the scores of its runs."""
+"""The tables of a comparison, as Markdown and CSV, from the result files of its runs."""
 
 import csv
 import io
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from statistics import mean
-from typing import Any
+from typing import Any, NamedTuple
 
-from sceneprior.apps.experiments.makers import LIFTED, PAPER
+from sceneprior.apps.config import load_any_run
+from sceneprior.apps.experiments.commands import read_journal, read_result
+from sceneprior.apps.experiments.comparison import Comparison, ViewComparison
+from sceneprior.apps.experiments.runs import LIFTED, PAPER, Run, Variant, variants_of
 from sceneprior.core.files import write_whole
-from sceneprior.evaluation.metric import ARROWS, Direction, TableColumn
+from sceneprior.evaluation.metric import ARROWS, TableColumn
 from sceneprior.evaluation.registry import DECODED, METRICS
+from sceneprior.lifted.trained import SAMPLER
+from sceneprior.paper.sampling import marked
+from sceneprior.training.checkpoints import read_checkpoint
 
 GAP = "–"
+AS_GIVEN = "as given"
+DECODED_ROOMS = "of training rooms, decoded"
+GROUPS = {
+    "paper": "rooms of new latents (paper)",
+    SAMPLER: "rooms of the lifted method's sampler, object by object",
+    "its own": "rooms of methods trained on {}",
+    AS_GIVEN: "scenes as given, made elsewhere",
+    DECODED_ROOMS: "training rooms, decoded: nothing is new",
+    "kernel": "copies: rooms near training rooms",
+}
+"""Group headings of a table of new rooms, in order, by `protocol.latents` of a result. `{}` stands
+for the method's supervision."""
+SHAPES = {"fit": "as found", "fit_cad": "CAD models"}
+"""Rows of an `eval-svr` result that the table shows, with their values in the column `shapes`."""
 COSTS = {
     "steps": TableColumn("steps", 0),
     "cpu_s": TableColumn("CPU min", 1),
@@ -24,29 +44,26 @@ FACTORS = {"cpu_s": 1 / 60, "parameters": 1e-6}
 """Factors from the units of costs to those of the table."""
 
 
-@dataclass(frozen=True)
-class Row:
-    """Result of one run."""
+class Row(NamedTuple):
+    """Result of one variant of a run."""
 
     rooms: str
+    rank: int
+    """Position of the row's group."""
     group: str
     title: str
     variant: str
-    """Value that distinguishes the row from other rows of its run; `Form.variant` is the heading of
-    its column."""
+    """Value of the second column, which distinguishes the row from other rows of its run."""
     seed: int | None
     """Seed of training; None for existing scenes."""
     scores: dict[str, Any]
     """Values by key of a result, with its protocol, reference rows and the costs of training."""
     made_by: str
-    """Name of the method in captions (`Maker.said`)."""
-    rank: int = 0
-    """Position of the row's group: groups are sorted by rank."""
+    """Name of the method in captions (`Variant.made_by`)."""
 
 
-@dataclass(frozen=True)
-class Form:
-    """Columns and captions of the tables of one kind of comparison."""
+class Form(NamedTuple):
+    """Columns and captions of the tables of one task."""
 
     columns: dict[str, TableColumn]
     """Columns by key of the scores; the columns of `COSTS` follow."""
@@ -58,10 +75,83 @@ class Form:
     """Builds the caption's sentence on the evaluation from one of the results."""
 
 
-def write_tables(rows: Sequence[Row], out: Path, form: Form) -> None:
-    """Write `table.md` and `table.csv` (one line per run) into a folder."""
-    write_whole(out / "table.md", markdown(rows, form).encode())
-    write_whole(out / "table.csv", as_csv(rows, form).encode())
+def write_tables(comparison: Comparison, runs: Sequence[Run], out: Path) -> None:
+    """Write `table.md` and `table.csv` (one line per run and variant) of evaluated runs."""
+    rows = [row for run in runs for row in rows_of(comparison, run)]
+    form = VIEWS if isinstance(comparison, ViewComparison) else NEW_ROOMS
+    write_whole(out / "table.md", markdown(rows, form))
+    write_whole(out / "table.csv", as_csv(rows, form))
+
+
+# -- From results to rows --------------------------------------------------------------------------
+
+
+def rows_of(comparison: Comparison, run: Run) -> list[Row]:
+    """The rows of an evaluated run; the first row includes the costs of training."""
+    found = {variant: read_result(variant.result) for variant in variants_of(comparison, run)}
+    of_task = _rows_of_views if isinstance(comparison, ViewComparison) else _rows_of_rooms
+    rows = list(of_task(run, comparison.rooms[run.rooms].title, found))
+    rows[0].scores.update(costs_of(run))
+    return rows
+
+
+def _rows_of_rooms(run: Run, rooms: str, found: dict[Variant, dict[str, Any]]) -> Iterator[Row]:
+    """A row for each distribution of latents, and one for decoded training rooms if there are
+    any."""
+
+    def row(variant: Variant, origin: str, scores: dict[str, Any]) -> Row:
+        group = GROUPS[origin].format(run.run_config.learns_from)
+        rank = list(GROUPS).index(origin)
+        made = variant.title, marked(origin), run.seed, scores, variant.made_by
+        return Row(rooms, rank, group, *made)
+
+    for variant, scores in found.items():
+        # A result names the distribution of its rooms, with the mark of the version that wrote it.
+        yield row(variant, scores["protocol"].get("latents", AS_GIVEN).split(",")[0], scores)
+    first, last = next(iter(found.values())), list(found)[-1]
+    if decoded := first.get("decoded_rooms"):
+        # The last variant decodes latents; a sampler, which decodes no room, would come first.
+        yield row(last, DECODED_ROOMS, {**decoded, "protocol": first["protocol"]})
+
+
+def _rows_of_views(run: Run, rooms: str, found: dict[Variant, dict[str, Any]]) -> Iterator[Row]:
+    """A row for each fit, and another one if its objects were also replaced by CAD models."""
+    group = f"trained on {run.run_config.learns_from}"
+    for variant, result in found.items():
+        of: dict[str, dict[str, Any]] = {
+            name: {**row["summary"], "intervals": row["intervals"]}
+            for name, row in result["rows"].items()
+        }
+        of["fit"]["seconds"] = result["cpu_seconds_an_image"]
+        references = {name: of[name] for name in VIEWS.references.values()}
+        for name, shapes in SHAPES.items():
+            if name in of:
+                scores = {**of[name], **references, "protocol": result["protocol"]}
+                made = variant.title, shapes, run.seed, scores, variant.made_by
+                yield Row(rooms, 0, group, *made)
+
+
+def costs_of(run: Run) -> dict[str, int | float | None]:
+    """Costs of training: `cpu_s`, `steps` and `parameters`; empty for scenes.
+
+    CPU seconds are None if they are unknown, since training was killed or started by hand.
+    """
+    if run.scenes is not None:
+        return {}
+    steps = 0
+    for final in (run.folder / "run").glob("*/final.ckpt"):
+        saved = read_checkpoint(final)
+        # Lightning counts updates; a GAN's two networks make two updates per batch.
+        steps += saved["global_step"] // len(saved["optimizer_states"])
+    networks = load_any_run(run.folder / "run").prior
+    return {
+        "cpu_s": read_journal(run.folder).get("fit", {}).get("cpu_s"),
+        "steps": steps,
+        "parameters": sum(item.numel() for item in networks.parameters()),
+    }
+
+
+# -- From rows to tables ---------------------------------------------------------------------------
 
 
 def markdown(rows: Sequence[Row], form: Form) -> str:
@@ -73,9 +163,8 @@ def markdown(rows: Sequence[Row], form: Form) -> str:
             for key, column in (form.columns | COSTS).items()
             if any(row.scores.get(key) is not None for row in own)
         }
-        titles = [column.title for column in columns.values()]
-        lines = [f"### {rooms}", "", _caption(own, form), ""]
-        lines.append(_line(["method", form.variant, *titles]))
+        head = ["method", form.variant, *(column.title for column in columns.values())]
+        lines = [f"### {rooms}", "", _caption(own, form), "", _line(head)]
         lines.append("| --- | --- |" + " ---: |" * len(columns))
         lines += [_line(cells) for cells in _body(own, columns, form)]
         parts.append("\n".join(lines))
@@ -100,39 +189,34 @@ def _line(cells: Sequence[str]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def _body(rows: Sequence[Row], columns: dict[str, TableColumn], form: Form) -> list[list[str]]:
+def _body(rows: Sequence[Row], columns: dict[str, TableColumn], form: Form) -> Iterator[list[str]]:
     """The cells of each line, including the headings of groups."""
 
-    def heading(group: str) -> list[str]:
-        return [f"*{group}*", *[""] * (len(columns) + 1)]
+    def line(title: str, second: str, found: Sequence[dict[str, Any]]) -> list[str]:
+        return [title, second, *(_cell(found, key, of) for key, of in columns.items())]
 
-    lines = [heading("reference")]
+    empty = [""] * (len(columns) + 1)
+    yield ["*reference*", *empty]
     for title, name in form.references.items():
-        values = rows[0].scores.get(name, {})
-        cells = [_cell([values.get(key)], key, of, values) for key, of in columns.items()]
-        lines.append([title, GAP, *cells])
+        yield line(title, GAP, [rows[0].scores.get(name, {})])
     ranked = sorted(rows, key=lambda row: row.rank)
     for group, members in _by(ranked, lambda row: row.group).items():
-        lines.append(heading(group))
+        yield [f"*{group}*", *empty]
         for runs in _by(members, lambda row: f"{row.title}: {row.variant}").values():
-            values = runs[0].scores if len(runs) == 1 else {}
-            cells = [
-                _cell([row.scores.get(key) for row in runs], key, of, values)
-                for key, of in columns.items()
-            ]
-            lines.append([runs[0].title, runs[0].variant, *cells])
-    return lines
+            yield line(runs[0].title, runs[0].variant, [row.scores for row in runs])
 
 
-def _cell(
-    found: Sequence[int | float | None], key: str, column: TableColumn, scores: dict[str, Any]
-) -> str:
-    """The mean of a value over seeds, with half its range, or with the interval of `scores`."""
-    values = [float(value) * FACTORS.get(key, 1.0) for value in found if value is not None]
+def _cell(found: Sequence[dict[str, Any]], key: str, column: TableColumn) -> str:
+    """The mean of a value over seeds, with half its range, or one value with its interval."""
+    values = [
+        float(scores[key]) * FACTORS.get(key, 1.0)
+        for scores in found
+        if scores.get(key) is not None
+    ]
     if not values:
         return GAP
     middle = f"{mean(values):,.{column.digits}f}"
-    if interval := scores.get("intervals", {}).get(key):
+    if len(found) == 1 and (interval := found[0].get("intervals", {}).get(key)):
         low, high = (f"{end:,.{column.digits}f}" for end in interval)
         return f"{middle} [{low}, {high}]"
     if len(values) == 1 or key in COSTS:
@@ -147,28 +231,18 @@ def _by(rows: Sequence[Row], key: Callable[[Row], str]) -> dict[str, list[Row]]:
     return groups
 
 
-def _arrowed(column: TableColumn, direction: Direction) -> TableColumn:
-    """The column with an arrow in its title for the better direction."""
-    return replace(column, title=column.title + ARROWS[direction])
-
-
 def _caption(rows: Sequence[Row], form: Form) -> str:
-    """The sentences above a table: the maker of each row, the evaluation, and the seeds."""
-    titles: dict[str, list[str]] = {PAPER.said: [], LIFTED: []}
+    """The sentences above a table: the method of each row, the evaluation, and the seeds."""
+    titles: dict[str, dict[str, None]] = {PAPER: {}, LIFTED: {}}
     for row in rows:
-        named = titles.setdefault(row.made_by, [])
-        if row.title not in named:
-            named.append(row.title)
-    parts = (
-        f"of {said}: " + (", ".join(f"'{title}'" for title in named) or "none")
-        for said, named in titles.items()
-    )
+        titles.setdefault(row.made_by, {})[f"'{row.title}'"] = None
+    parts = (f"of {said}: {', '.join(named) or 'none'}" for said, named in titles.items())
     seeds = sorted({row.seed for row in rows if row.seed is not None})
     told = ", ".join(map(str, seeds)) or "none"
     return f"Rows {'; '.join(parts)}. {form.say(rows[0].scores)}; seeds {told}."
 
 
-def _of_new_rooms(scores: dict[str, Any]) -> str:
+def _say_rooms(scores: dict[str, Any]) -> str:
     protocol = scores["protocol"]
     return (
         f"{protocol['n_generated']} generated rooms per run against {protocol['n_test']} test "
@@ -176,7 +250,7 @@ def _of_new_rooms(scores: dict[str, Any]) -> str:
     )
 
 
-def _of_views(scores: dict[str, Any]) -> str:
+def _say_views(scores: dict[str, Any]) -> str:
     protocol = scores["protocol"]
     surfaces, known = scores["with_surface"], protocol["known_model_share"]
     objects = f"{scores['objects']} objects"
@@ -196,7 +270,11 @@ def _of_views(scores: dict[str, Any]) -> str:
 
 
 NEW_ROOMS = Form(
-    columns={m.key: _arrowed(m.column, m.direction) for m in (*METRICS, *DECODED) if m.column},
+    columns={
+        metric.key: replace(metric.column, title=metric.column.title + ARROWS[metric.direction])
+        for metric in (*METRICS, *DECODED)
+        if metric.column
+    },
     references={
         "Independent objects, as boxes": "independent",
         "Independent objects, with meshes": "independent_meshes",
@@ -204,26 +282,24 @@ NEW_ROOMS = Form(
         "Real training rooms": "train_rooms",
     },
     variant="latents",
-    say=_of_new_rooms,
+    say=_say_rooms,
 )
-CD = TableColumn("CD (m)", 3, "CD: mean distance to the other surface, both ways added")
-SECONDS = TableColumn(
-    "s per image",
-    3,
+_CD = "CD: mean distance to the other surface, both ways added"
+_SECONDS = (
     "s per image: CPU seconds, all images together; [from, to]: 95% interval over rooms, all views "
-    "of a room together",
+    "of a room together"
 )
 VIEWS = Form(
     columns={
-        "box_iou_3d": _arrowed(TableColumn("3D box IoU", 3), "higher"),
-        "chamfer_l2_m": _arrowed(CD, "lower"),
-        "f_score": _arrowed(TableColumn("F at 5 cm", 3), "higher"),
-        "seconds": _arrowed(SECONDS, "lower"),
+        "box_iou_3d": TableColumn("3D box IoU ↑", 3),
+        "chamfer_l2_m": TableColumn("CD (m) ↓", 3, _CD),
+        "f_score": TableColumn("F at 5 cm ↑", 3),
+        "seconds": TableColumn("s per image ↓", 3, _SECONDS),
     },
     references={
         "Nearest training room by masks": "nearest_room",
         "Random training room": "random_room",
     },
     variant="shapes",
-    say=_of_views,
+    say=_say_views,
 )

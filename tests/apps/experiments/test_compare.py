@@ -1,4 +1,4 @@
-"""A comparison of tiny runs, through the command: trained, judged, gone on with, tabulated."""
+"""Comparisons: what is refused, which runs there are, and how a stopped one is continued."""
 
 import json
 import shutil
@@ -6,49 +6,23 @@ from functools import partial
 from operator import attrgetter
 from pathlib import Path
 
+import h5py
 import pytest
 import yaml
 from cli_helpers import call_here
-from tiny_runs import tiny_baseline_settings, write_tiny_config
-from toy_metrics import without_classifiers
+from made_results import METHODS, write_comparison, write_new_rooms
+from refusals import refused
+from tiny_runs import tiny_baseline_settings
 
-from sceneprior.apps.config import load_any_run, load_config
-from sceneprior.apps.experiments.compare import Compared, CompareOptions, compare, scoring_steps
-from sceneprior.apps.experiments.comparison import (
-    load_comparison,
-    part_of,
-    runs_of,
-    shards_of,
-    variants_of,
-)
-from sceneprior.apps.experiments.rows import costs_of
-from sceneprior.apps.experiments.steps import StepRunner
-from sceneprior.core.errors import InputError
-
-SOFTWARE = CompareOptions()
-METHODS = {
-    "ours": {},
-    "lstm": {
-        "title": "LSTM",
-        "set": {"every": ["model.decoder={name: lstm}"], "toy": ["model.width=8"]},
-    },
-}
-
-
-def write_comparison(folder: Path, shards: Path, **changes) -> str:
-    """A comparison's YAML of one kind of room and two methods."""
-    config = folder / "tiny.yaml"
-    if not config.is_file():
-        write_tiny_config(config, shards, layout__epochs=1, shape__epochs=1)
-    data = {
-        "seeds": [0],
-        "count": 4,
-        "rooms": {"toy": {"title": "Toys", "config": str(config)}},
-        "methods": METHODS,
-    }
-    path = folder / "compare.yaml"
-    path.write_text(yaml.safe_dump(data | changes, sort_keys=False))
-    return str(path)
+from sceneprior.apps.config import load_any_run
+from sceneprior.apps.experiments import commands
+from sceneprior.apps.experiments.compare import Compared, commands_of, compare
+from sceneprior.apps.experiments.comparison import part_of
+from sceneprior.apps.experiments.runs import load_comparison, runs_of, shards_of
+from sceneprior.apps.experiments.table import costs_of, rows_of
+from sceneprior.core.errors import ConfigError
+from sceneprior.core.files import write_json
+from sceneprior.paper.fit_image import SCHEDULES, FitSchedule
 
 
 @pytest.fixture
@@ -56,330 +30,260 @@ def written(toy_shards, tmp_path):
     return partial(write_comparison, tmp_path, toy_shards)
 
 
-def test_every_run_has_its_settings_its_seed_and_its_folder(written):
+# -- Settings --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("key", {"seed": [0]}),
+        ("seeds", {"seeds": [1, 1]}),
+        ("title_twice", {"methods": {"a": {}, "b": {}}}),
+        ("rooms_of_scenes", {"methods": {"a": {"title": "A", "scenes": {"attic": "b"}}}}),
+        ("scenes_and_config",
+         {"methods": {"a": {"title": "A", "scenes": {"toy": "b"}, "config": "c.yaml"}}}),
+        ("scenes_title", {"methods": {"a": {"scenes": {"toy": "b"}}}}),
+        ("baseline_title", {"methods": {"a": {"config": "baselines/gan.yaml"}}}),
+        ("rooms_of_set", {"methods": {"a": {"title": "A", "set": {"attic": []}}}}),
+        ("key_of_set", {"methods": {"a": {"title": "A", "set": {"toy": ["model.widht=3"]}}}}),
+        ("distributions", {"distributions": ["anywhere"]}),
+        ("task", {"task": "nowhere"}),
+        ("task_type", {"task": ["a"]}),
+        ("fits", {"task": "single_views", "fits": ["guess"]}),
+        ("key_of_task", {"task": "new_rooms", "views": 2}),
+        ("views_of_scenes",
+         {"task": "single_views", "methods": {"a": {"title": "A", "scenes": {"toy": "b"}}}}),
+    ],
+)  # fmt: skip
+def test_a_wrong_comparison_is_refused_before_anything_runs(written, tmp_path, name, changes):
+    path = written(**changes)
+    with refused(f"apps/compare_{name}", ConfigError, tmp=tmp_path):
+        load_comparison(path)
+
+
+def test_rooms_without_a_truth_are_refused_before_anything_is_trained(toy_shards, tmp_path):
+    blind = shutil.copytree(toy_shards, tmp_path / "blind")
+    for path in (blind / "test").glob("*.h5"):
+        with h5py.File(path, "r+") as file:
+            for room in file["rooms"].values():
+                del room["ground_truth"]
+    comparison = load_comparison(write_comparison(tmp_path, blind, task="single_views"))
+    with refused("apps/compare_blind", tmp=tmp_path):
+        compare(comparison, comparison, tmp_path / "out")
+    assert not (tmp_path / "out" / "toy").exists()
+
+
+def test_a_part_keeps_the_order_and_names_what_there_is(written):
     comparison = load_comparison(written(seeds=[0, 1]))
-    runs = runs_of(comparison, Path("out"))
-    assert [(run.method, run.seed) for run in runs] == [
-        ("ours", 0), ("lstm", 0), ("ours", 1), ("lstm", 1),
-    ]  # fmt: skip
-    assert runs[3].settings == ("model.decoder={name: lstm}", "model.width=8", "seed=1")
-    assert runs[3].folder == Path("out/toy/lstm/seed1")
+    part = part_of(comparison, "lstm, paper", "toy", "1")
+    assert tuple(part.methods) == ("paper", "lstm") and part.seeds == (1,)
+    runs = runs_of(part, Path("out"))
+    assert [(run.method, run.seed, run.folder) for run in runs] == [
+        (name, 1, Path(f"out/toy/{name}/seed1")) for name in ("paper", "lstm")
+    ]
+    for name, given in {
+        "method": ("gan", None, None), "seed": (None, None, "7"), "no_rooms": (None, ",", None),
+    }.items():  # fmt: skip
+        with refused(f"apps/compare_part_{name}"):
+            part_of(comparison, *given)
 
 
 def test_rooms_change_the_config_that_methods_share(written, tmp_path):
     rooms = {"title": "Toys", "config": str(tmp_path / "tiny.yaml")}
     changes = ["data.shards=large", "model.max_objects=2", "layout.epochs=9"]
     kinds = {"toy": rooms, "more": {**rooms, "title": "More", "set": changes}}
-    own = tmp_path / "gan.yaml"
-    own.write_text(yaml.safe_dump(tiny_baseline_settings(Path("elsewhere"), "gan")))
     trained = {
-        "ours": {},
+        "paper": {},
         "lstm": {**METHODS["lstm"], "set": {"more": ["layout.epochs=8"]}},
-        "gan": {"title": "GAN", "config": str(own)},
+        "gan": {"title": "GAN", "config": str(tmp_path / "gan.yaml")},
     }
     theirs = {"theirs": {"title": "Theirs", "scenes": {"more": "theirs"}}}
     comparison = load_comparison(written(rooms=kinds, methods=trained | theirs))
     runs = {(run.rooms, run.method): run for run in runs_of(comparison, Path())}
     configs = {key: run.run_config for key, run in runs.items()}
     assert {key: config.layout.epochs for key, config in configs.items() if key[1] != "gan"} == {
-        ("toy", "ours"): 1, ("toy", "lstm"): 1, ("more", "ours"): 9, ("more", "lstm"): 8,
+        ("toy", "paper"): 1, ("toy", "lstm"): 1, ("more", "paper"): 9, ("more", "lstm"): 8,
         ("more", "theirs"): 9,
     }  # fmt: skip
     assert {configs["more", name].model.max_objects for name in trained} == {2}
     assert {configs["more", name].data.shards for name in trained} == {"large"}
     assert shards_of(comparison, "more") == Path("large") != shards_of(comparison, "toy")
-    (step,) = scoring_steps(comparison, runs["more", "theirs"], 4, SOFTWARE)
-    assert step.arguments[step.arguments.index("--shards") + 1] == "large"
 
 
 def test_a_method_with_a_config_of_its_own_learns_from_the_same_rooms(written, tmp_path):
-    own = tmp_path / "gan.yaml"
+    own = tmp_path / "own.yaml"
     settings = tiny_baseline_settings(Path("elsewhere"), "gan", model__max_objects=3)
     own.write_text(yaml.safe_dump(settings | {"label_set": "void,bed"}))
-    changes = {"every": ["training.epochs=7"]}
-    gan = {"title": "GAN", "config": str(own), "set": changes}
-    comparison = load_comparison(written(methods={"ours": METHODS["ours"], "gan": gan}))
-    ours, other = runs_of(comparison, Path())
-    assert (ours.config, ours.settings) == (str(tmp_path / "tiny.yaml"), ("seed=0",))
-    assert other.config == str(own)
-    theirs, mine = (load_config(run.config, run.settings) for run in (ours, other))
-    assert (mine.method, mine.training.epochs) == ("gan", 7)
+    gan = {"title": "GAN", "config": str(own), "set": {"every": ["training.epochs=7"]}}
+    comparison = load_comparison(written(methods={"paper": {}, "gan": gan}))
+    ours, other = (run.run_config for run in runs_of(comparison, Path()))
+    assert (other.method, other.training.epochs) == ("gan", 7)
     for name in ("label_set", "seed", "model.max_objects", "data.shards"):
-        assert attrgetter(name)(mine) == attrgetter(name)(theirs), name
-    # No config but ours has to have room for a number of objects.
+        assert attrgetter(name)(other) == attrgetter(name)(ours), name
+    # Only configs that limit the number of objects get the limit of the rooms.
     own.write_text("method: sync2gen\nlabel_set: a\nseed: 1\n")
     assert runs_of(comparison, Path())[1].settings == (
-        'label_set="front3d_bedroom"',
-        f'data.shards="{theirs.data.shards}"',
-        "training.epochs=7",
-        "seed=0",
-    )
-    own.unlink()
-    with pytest.raises(InputError, match=r"No config '.*gan\.yaml'"):
-        load_comparison(str(tmp_path / "compare.yaml"))
+        'label_set="front3d_bedroom"', f'data.shards="{ours.data.shards}"',
+        "training.epochs=7", "seed=0",
+    )  # fmt: skip
 
 
-def test_a_part_keeps_the_order_and_names_what_there_is(written):
-    comparison = load_comparison(written(seeds=[0, 1]))
-    part = part_of(comparison, "lstm, ours", "toy", "1")
-    assert tuple(part.methods) == ("ours", "lstm") and part.seeds == (1,)
-    with pytest.raises(InputError, match="No method 'gan' in this comparison; it has ours, lstm"):
-        part_of(comparison, "gan", None, None)
-    with pytest.raises(InputError, match="No seed '7'"):
-        part_of(comparison, None, None, "7")
-    with pytest.raises(InputError, match="No kind of rooms was named"):
-        part_of(comparison, None, ",", None)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"seed": [0]}, "unknown key 'seed'; the nearest valid key is 'seeds'"),
-        ({"seeds": [1, 1]}, "seeds must be distinct integers of at least 0"),
-        (
-            {"methods": {"a": {}, "b": {}}},
-            "the title 'Paper's method' is given twice; a title names a row, so give methods.a",
-        ),
-        (
-            {"methods": {"a": {"title": "A", "scenes": {"attic": "b"}}}},
-            "methods.a.scenes has 'attic'; expected one of toy",
-        ),
-        (
-            {"methods": {"a": {"title": "A", "scenes": {"toy": "b"}, "config": "c.yaml"}}},
-            "scenes are evaluated as they are, so `config` and `set` have no effect on them",
-        ),
-        (
-            {"methods": {"a": {"scenes": {"toy": "b"}}}},
-            "scenes need a title, since no config names their method",
-        ),
-        (
-            {"methods": {"a": {"config": "baselines/gan.yaml"}}},
-            "methods.a has no title; only the paper's and the lifted method are named by their "
-            "configs",
-        ),
-        (
-            {"methods": {"a": {"title": "A", "set": {"attic": []}}}},
-            "methods.a.set has 'attic'; expected every or one of toy",
-        ),
-        (
-            {"methods": {"a": {"title": "A", "set": {"toy": ["model.widht=3"]}}}},
-            "unknown key 'model.widht'; the nearest valid key is 'model.width'",
-        ),
-    ],
-)
-def test_what_is_wrong_with_a_comparison_is_said_before_anything_runs(written, changes, message):
-    with pytest.raises(InputError, match=message):
-        load_comparison(written(**changes))
-
-
-@pytest.fixture(scope="module")
-def trained(toy_shards, tmp_path_factory) -> Path:
-    """`ours` of the comparison below, trained and judged."""
-    folder = tmp_path_factory.mktemp("compared")
-    comparison = load_comparison(write_comparison(folder, toy_shards))
-    part = part_of(comparison, "ours", None, None)
-    with pytest.MonkeyPatch.context() as patch:
-        without_classifiers(patch)
-        patch.setattr(StepRunner, "call", call_here)
-        done = compare(comparison, part, folder / "out", SOFTWARE)
-    assert done == Compared(folder / "out" / "table.md", [], [])
-    return folder
+# -- Runs that are continued -----------------------------------------------------------------------
 
 
 @pytest.fixture
-def begun(trained, toy_shards, tmp_path) -> Path:
-    """A copy of it, to go on with: nothing in it knows where it lies."""
-    shutil.copytree(trained, tmp_path / "copy")
-    write_comparison(tmp_path / "copy", toy_shards)
-    return tmp_path / "copy"
+def begun(toy_run, toy_shards, tmp_path):
+    """The toy run as a finished run of a comparison, with results that are made up."""
+    change = partial(
+        write_comparison, tmp_path, toy_shards, seeds=[3],
+        rooms={"toy": {"title": "Toys", "config": str(tmp_path / "own.yaml")}},
+    )  # fmt: skip
+    shutil.copy(toy_run / "config.yaml", tmp_path / "own.yaml")
+    comparison = load_comparison(change())
+    run = runs_of(comparison, tmp_path / "out")[0]
+    shutil.copytree(toy_run, run.folder / "run")
+    journal = {}
+    for number, each in enumerate(commands_of(comparison, run, 4)):
+        journal[each.name] = {
+            "arguments": each.arguments, "depends_on": each.depends_on, "finished": True,
+            "cpu_s": 2.5, "wall_s": 3.0, "peak_memory_gib": 0.5,
+        }  # fmt: skip
+        if each.name != "fit":
+            write_new_rooms(each.result, number, each.arguments[-1], remembers=number == 1)
+    write_json(run.folder / "steps.json", journal)
+    return change
 
 
 class Calls:
     """Stands in for the commands; says how each ends."""
 
-    def __init__(self, status=0, before=lambda arguments: None):
-        self.names, self.status, self.before = [], status, before
+    def __init__(self):
+        self.arguments, self.status, self.stopped = [], 0, False
 
-    def __call__(self, runner, arguments, log):
-        self.names.append(arguments[0])
-        self.before(arguments)
+    def __call__(self, arguments, log):
+        self.arguments.append(arguments)
         log.write_text("working\nError: no room for more.\n")
-        return self.status, {"cpu_s": 2.5, "wall_s": 3.0, "peak_memory_gib": 0.5}
+        costs = {"cpu_s": 2.5, "wall_s": 3.0, "peak_memory_gib": 0.5}
+        return self.status, costs, self.stopped
+
+    @property
+    def names(self):
+        return [words[0] for words in self.arguments]
 
 
 @pytest.fixture
 def calls(monkeypatch) -> Calls:
     calls = Calls()
-    monkeypatch.setattr(StepRunner, "call", lambda *given: calls(*given))
+    monkeypatch.setattr(commands, "call", calls)
     return calls
 
 
-def again(begun: Path, toy_shards: Path, part: str | None = "ours", **changes) -> Compared:
-    comparison = load_comparison(write_comparison(begun, toy_shards, **changes))
-    return compare(comparison, part_of(comparison, part, None, None), begun / "out", SOFTWARE)
+def again(begun, tmp_path, part: str | None = "paper", **changes) -> Compared:
+    comparison = load_comparison(begun(**changes))
+    return compare(comparison, part_of(comparison, part, None, None), tmp_path / "out")
 
 
-def test_a_run_is_trained_judged_and_tabulated(trained, toy_shards):
-    comparison = load_comparison(write_comparison(trained, toy_shards))
-    run = runs_of(comparison, trained / "out")[0]
-    noted = json.loads((run.folder / "steps.json").read_text())
-    assert noted["fit"]["finished"] and noted["fit"]["cpu_s"] > 0
-    assert noted["fit"]["arguments"][:2] == ["fit", "--config"]
-    assert "--devices 1 --resume" in " ".join(noted["fit"]["arguments"])
+def test_costs_are_those_of_training(begun, tmp_path, toy_run):
+    run = runs_of(load_comparison(begun()), tmp_path / "out")[0]
+    count = sum(item.numel() for item in load_any_run(toy_run).prior.parameters())
     costs = costs_of(run)
-    assert costs["steps"] == 3 + 2  # 12 rooms in batches of 5, then of 6
-    count = sum(item.numel() for item in load_any_run(run.folder / "run").prior.parameters())
-    assert (costs["parameters"], costs["cpu_s"]) == (count, noted["fit"]["cpu_s"])
-    table = (trained / "out" / "table.md").read_text()
-    assert "LSTM" not in table and "4 generated rooms" in table
-    latents = [
-        line.split(" | ")[1] for line in table.splitlines() if line.startswith("| Paper's method ")
-    ]
-    assert latents == ["paper", "of training rooms, decoded", "kernel, copies: near training rooms"]
-    assert {"scores.json", "scores_kernel.json"} < {path.name for path in run.folder.iterdir()}
+    assert (costs["cpu_s"], costs["parameters"]) == (2.5, count)
+    # 12 rooms in batches of 5 in the layout stage, then of 6.
+    config = run.run_config
+    assert costs["steps"] == 3 * config.layout.epochs + 2 * config.shape.epochs
 
 
-def test_what_is_done_is_not_repeated_and_stays_in_the_table(begun, toy_shards, calls):
-    assert again(begun, toy_shards).failures == [] and calls.names == []
+def test_finished_commands_are_not_repeated_and_stay_in_the_table(begun, tmp_path, calls):
+    done = again(begun, tmp_path)
+    assert done == Compared(tmp_path / "out" / "table.md", [], []) and calls.names == []
+    table = done.table.read_text()
+    assert "| Paper's method | paper |" in table and "LSTM" not in table
     # A second method joins, and fails.
     calls.status = 2
-    done = again(begun, toy_shards, None)
-    assert calls.names == ["fit"] and done.failures == ["toy, lstm, seed 0: no room for more."]
-    assert "| Paper's method |" in (begun / "out" / "table.md").read_text()
+    done = again(begun, tmp_path, None)
+    assert calls.names == ["fit"] and done.failures == ["toy, lstm, seed 3: no room for more."]
+    assert done.table.read_text() == table
 
 
-def test_a_part_that_is_judged_otherwise_names_the_rows_it_leaves_out(begun, toy_shards, calls):
-    done = again(begun, toy_shards, "lstm", count=5)
-    assert done.table is None and done.left_out == ["toy, ours, seed 0"]
+def test_a_deleted_result_is_made_again_with_all_that_follows(begun, tmp_path, calls):
+    (tmp_path / "out/toy/paper/seed3/run/shape/final.ckpt").unlink()
+    again(begun, tmp_path)
     assert calls.names == ["fit", "eval-fid", "eval-fid"]
-    again(begun, toy_shards, "ours", count=5)
+
+
+def test_a_part_that_is_evaluated_otherwise_names_the_rows_it_leaves_out(begun, tmp_path, calls):
+    done = again(begun, tmp_path, "lstm", count=5)
+    assert done.table is None and done.left_out == ["toy, paper, seed 3"]
+    assert calls.names == ["fit", "eval-fid", "eval-fid"]
+    again(begun, tmp_path, "paper", count=None)
     assert calls.names[3:] == ["eval-fid", "eval-fid"]
+    words = calls.arguments[-1]
+    assert words[words.index("-n") + 1] == "12"  # as many as training rooms
 
 
-def test_without_a_count_as_many_rooms_are_made_as_are_trained_on(begun, toy_shards, calls):
-    said = []
-    calls.before = said.append
-    again(begun, toy_shards, count=None)
-    assert said[0][said[0].index("-n") + 1] == "12"
-
-
-def test_a_run_of_other_settings_is_named_and_left_as_it_is(begun, toy_shards, calls):
-    (begun / "tiny.yaml").write_text(
-        (begun / "tiny.yaml").read_text().replace("epochs: 1\n", "epochs: 2\n", 1)
-    )
-    comparison = load_comparison(str(begun / "compare.yaml"))
-    done = compare(comparison, part_of(comparison, "ours", None, None), begun / "out", SOFTWARE)
+def test_a_run_of_other_settings_is_named_and_left_as_it_is(begun, tmp_path, calls):
+    done = again(begun, tmp_path, methods={"paper": {"set": {"every": ["shape.epochs=9"]}}})
     assert done.table is None and calls.names == []
     assert done.failures == [
-        f"toy, ours, seed 0: {begun}/out/toy/ours/seed0 holds a run with other settings "
+        f"toy, paper, seed 3: {tmp_path}/out/toy/paper/seed3 holds a run with other settings "
         "than those of the comparison; delete it to train again, or name another --out."
     ]
+    # The default distribution has no effect on training.
+    changed = {"paper": {"set": {"every": ["sampling.distribution=kernel"]}}}
+    assert again(begun, tmp_path, methods=changed).failures == [] and calls.names == []
 
 
-def test_where_rooms_are_drawn_from_by_default_is_no_other_training(begun, toy_shards, calls):
-    config = begun / "tiny.yaml"
-    config.write_text(config.read_text() + "sampling: {distribution: kernel}\n")
-    assert again(begun, toy_shards).failures == [] and calls.names == []
-
-
-def test_a_truncated_file_is_a_sentence(begun, toy_shards, calls):
-    folder = begun / "out" / "toy" / "ours" / "seed0"
+def test_a_damaged_file_is_named(begun, tmp_path, calls):
+    folder = tmp_path / "out" / "toy" / "paper" / "seed3"
     (folder / "scores.json").write_bytes((folder / "scores.json").read_bytes()[:40])
-    with pytest.raises(InputError, match=r"seed0/scores\.json is damaged; delete it and run"):
-        again(begun, toy_shards)
+    with refused("apps/compare_damaged", tmp=tmp_path):
+        again(begun, tmp_path)
     (folder / "steps.json").write_bytes((folder / "steps.json").read_bytes()[:40])
-    (failure,) = again(begun, toy_shards).failures
-    assert "seed0/steps.json is damaged; delete it and run the same command" in failure
+    (failure,) = again(begun, tmp_path).failures
+    assert "seed3/steps.json is damaged; delete it and run the same command" in failure
 
 
-def test_a_stopped_comparison_says_how_it_goes_on(command, written, calls, tmp_path):
-    def stop(arguments):
-        raise KeyboardInterrupt
-
-    calls.before = stop
+def test_a_stopped_comparison_says_how_to_continue(command, written, calls, tmp_path):
+    calls.stopped = True
     status, _, errors = command("compare", "--config", written(), "--out", tmp_path / "out")
     assert status == 130 and errors.endswith("Stopped. Run the same command again to continue.\n")
-    assert not (tmp_path / "out" / "table.md").exists()
+    assert calls.names == ["fit"] and not (tmp_path / "out" / "table.md").exists()
 
 
-def test_a_folder_that_is_a_file_is_a_sentence(begun):
-    (begun / "file").touch()
-    comparison = load_comparison(str(begun / "compare.yaml"))
-    with pytest.raises(InputError, match="file cannot be written"):
-        compare(comparison, comparison, begun / "file", SOFTWARE)
-
-
-def test_methods_without_latents_of_rooms_are_evaluated_once_by_their_own(written, tmp_path):
-    own = tmp_path / "atiss.yaml"
-    own.write_text(yaml.safe_dump(tiny_baseline_settings(Path("elsewhere"), "atiss")))
-    atiss = {"title": "ATISS", "config": str(own)}
-    comparison = load_comparison(
-        written(
-            methods={"ours": METHODS["ours"], "atiss": atiss}, distributions=["paper", "kernel"]
-        )
-    )
-    ours, other = (
-        scoring_steps(comparison, run, 4, SOFTWARE) for run in runs_of(comparison, Path())
-    )
-    assert [step.name for step in ours] == ["scores", "scores_kernel"]
-    assert [step.arguments[-1] for step in ours] == ["paper", "kernel"]
-    (step,) = other
-    assert step.name == "scores" and "--distribution" not in step.arguments
-    with pytest.raises(InputError, match="distributions"):
-        load_comparison(written(distributions=["anywhere"]))
-
-
-def test_the_large_comparison_loads_and_says_where_rooms_come_from():
-    comparison = load_comparison("compare/new_rooms.yaml")
-    origins = {
-        run.method: [variant.name for variant in variants_of(comparison, run)]
-        for run in runs_of(comparison, Path())
-    }
-    assert origins["lifted"] == [None, "paper", "kernel"]
-    assert origins["lstm"] == origins["c1"] == ["paper", "kernel"]
-    assert origins["atiss"] == [None]
-
-
-def test_scenes_that_are_there_are_a_row_beside_ours(begun, toy_shards, scenes, monkeypatch):
-    monkeypatch.setattr(StepRunner, "call", call_here)
-    scenes = shutil.copytree(scenes, begun / "given", ignore=shutil.ignore_patterns("scores.json"))
-    given = {"title": "Theirs", "scenes": {"toy": str(scenes)}}
-    methods = {"ours": {}, "theirs": given}
-    done = again(begun, toy_shards, "theirs", methods=methods)
+def test_existing_scenes_are_a_row_and_evaluated_again_when_they_change(
+    begun, toy_shards, scenes, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(commands, "call", call_here)
+    scenes = shutil.copytree(scenes, tmp_path / "given", ignore=shutil.ignore_patterns("scores*"))
+    methods = {"paper": {}, "theirs": {"title": "Theirs", "scenes": {"toy": str(scenes)}}}
+    done = again(begun, tmp_path, "theirs", methods=methods)
     assert done.failures == [] and done.left_out == []
-    folder = begun / "out" / "toy" / "theirs"
+    folder = tmp_path / "out" / "toy" / "theirs"
     words = json.loads((folder / "steps.json").read_text())["scores"]["arguments"]
     assert " ".join(words).startswith(f"eval-fid --scenes {scenes} --shards {toy_shards} --out")
     assert not (folder / "run").exists() and not (scenes / "scores.json").exists()
-    table = (begun / "out" / "table.md").read_text()
-    assert "of scenes as given, which were made elsewhere: 'Theirs'." in table
-    heads = [line.strip("| ") for line in table.splitlines() if line.startswith("| *")]
-    assert heads == [
-        "*reference*", "*rooms of new latents (paper)*", "*scenes as given, made elsewhere*",
-        "*training rooms, decoded: nothing is new*", "*copies: rooms near training rooms*",
-    ]  # fmt: skip
-    (line,) = (line for line in table.splitlines() if line.startswith("| Theirs "))
+    (line,) = (x for x in done.table.read_text().splitlines() if x.startswith("| Theirs "))
     assert line.split(" | ")[1] == "as given" and line.endswith("| – | – | – |")
     assert line.split(" | ")[2:] != ["–"] * len(line.split(" | ")[2:])
-
-
-def test_scenes_are_evaluated_again_when_they_change_and_need_as_many_as_others(
-    begun, toy_shards, scenes, calls
-):
-    scenes = shutil.copytree(scenes, begun / "given")
-    methods = {"ours": {}, "theirs": {"title": "Theirs", "scenes": {"toy": str(scenes)}}}
-
-    def states() -> str:
-        comparison = load_comparison(write_comparison(begun, toy_shards, methods=methods))
-        run = next(run for run in runs_of(comparison, begun / "out") if run.scenes is not None)
-        assert (run.seed, run.title) == (None, "toy, theirs") and costs_of(run) == {}
-        (step,) = scoring_steps(comparison, run, 4, SOFTWARE)
-        return step.depends_on[-1]
-
-    before = states()
-    assert states() == before
+    calls = Calls()
+    monkeypatch.setattr(commands, "call", calls)
+    again(begun, tmp_path, "theirs", methods=methods)
+    assert calls.names == []
     (scenes / "room_0.json").write_text((scenes / "room_1.json").read_text() + " ")
-    assert states() != before
-    calls.status = 2
-    done = again(begun, toy_shards, "theirs", methods=methods)
-    assert done.failures == ["toy, theirs: no room for more."] and calls.names == ["eval-fid"]
+    again(begun, tmp_path, "theirs", methods=methods)
+    assert calls.names == ["eval-fid"]
+
+
+def test_a_fit_of_single_views_is_scored_and_tabulated(toy_run, toy_shards, tmp_path, monkeypatch):
+    monkeypatch.setitem(SCHEDULES, "paper", FitSchedule(steps=6, drop_at=3))
+    path = write_comparison(
+        tmp_path, toy_shards, task="single_views", fits=["paper"], cad_models=None, count=1
+    )
+    comparison = load_comparison(path)
+    run = runs_of(comparison, tmp_path / "out")[0]
+    shutil.copytree(toy_run, run.folder / "run")
+    status, _, _ = call_here(commands_of(comparison, run, 1)[-1].arguments, tmp_path / "log")
+    assert status == 0, (tmp_path / "log").read_text()
+    (row,) = rows_of(comparison, run)
+    assert row.title == "Paper: fit of a latent" and row.scores["parameters"]
+    assert row.scores["images"] == 2 and row.scores["seconds"] > 0

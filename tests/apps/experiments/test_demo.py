@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from sceneprior.apps.experiments.demo import demo_steps, run_demo
-from sceneprior.apps.experiments.steps import StepRunner
+from sceneprior.apps.experiments import commands
+from sceneprior.apps.experiments.demo import demo_commands, run_demo
 from sceneprior.core.errors import InputError
 from sceneprior.core.settings import find_config
 
@@ -20,18 +20,19 @@ def ran(tmp_path, monkeypatch):
     """Arguments of the commands that were called, and their exit status by command."""
     called: list[list[str]] = []
     status: dict[str, int] = {}
-    results = {step.arguments[0]: step.result for step in demo_steps(tmp_path, *SETTINGS)}
+    results = {step.arguments[0]: step.result for step in demo_commands(tmp_path, *SETTINGS)}
 
-    def call(runner, arguments, log):
+    def call(arguments, log):
         assert log is None  # progress goes to the terminal
         called.append(arguments)
         if not status.get(arguments[0]):
             path = results[arguments[0]]
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(json.dumps({"protocol": {}}))
-        return status.get(arguments[0], 0), {"cpu_s": 3.0, "wall_s": 2.0, "peak_memory_gib": 0.5}
+        costs = {"cpu_s": 3.0, "wall_s": 2.0, "peak_memory_gib": 0.5}
+        return status.get(arguments[0], 0), costs, False
 
-    monkeypatch.setattr(StepRunner, "call", call)
+    monkeypatch.setattr(commands, "call", call)
     return called, status
 
 

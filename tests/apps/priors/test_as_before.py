@@ -6,7 +6,7 @@ import zipfile
 import pytest
 import torch
 from golden_values import assert_as_before
-from tiny_runs import tiny_config, tiny_sampler_config
+from tiny_runs import tiny_config
 
 from sceneprior.apps.config import load_any_run
 from sceneprior.apps.priors.packed import FILES, pack, read_packed, write_packed

@@ -12,6 +12,8 @@ from sceneprior.apps.retrieval.retrieve import retrieval_report, retrieve, retri
 from sceneprior.core.geometry.turns import quarter_rotation
 from sceneprior.core.scene import Mesh, Scene, SceneObject, quarter_turned
 
+BED = ((0, 0.3, 0), (1.8, 0.6, 2)), ((0, 0.9, -0.95), (1.8, 0.6, 0.1))
+
 
 def meshed(label: str, center_m, size_m, mesh: trimesh.Trimesh, turns: int) -> SceneObject:
     """An object whose mesh is another one's, turned and stretched into its box."""
@@ -72,7 +74,7 @@ def test_models_of_a_folder(rooms, tmp_path):
     shapes = {
         "plain": ("Three-seat / Multi-seat Sofa", blocks(((0, 0.5, 0), (1, 1, 1)))),
         "corner": ("L-shaped Sofa", corner_sofa()),
-        "bed": ("King-size Bed", blocks(((0, 0.3, 0), (1.8, 0.6, 2)), ((0, 0.9, -0.95), (1.8, 0.6, 0.1)))),
+        "bed": ("King-size Bed", blocks(*BED)),
         "low": ("King-size Bed", blocks(((0, 0.3, 0), (1.8, 0.6, 2)))),
     }  # fmt: skip
     folder = write_models(tmp_path / "models", shapes)

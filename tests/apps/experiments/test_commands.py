@@ -1,4 +1,4 @@
-"""The runner of steps, with real processes that do next to nothing."""
+"""Commands of experiments, in real processes that do next to nothing."""
 
 import json
 import os
@@ -10,27 +10,31 @@ import time
 
 import pytest
 
-from sceneprior.apps.experiments.steps import Step, failure_reason, is_done, open_runner
+from sceneprior.apps.experiments.commands import (
+    Command,
+    call,
+    failure_reason,
+    is_done,
+    run_command,
+)
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import only_writer
 
 
 @pytest.fixture
-def version(tmp_path) -> Step:
+def version(tmp_path) -> Command:
     """A command that ends at once; its log is what it leaves."""
-    return Step("say", ["--version"], tmp_path / "say.log", depends_on=["a"])
+    return Command("say", ["--version"], tmp_path / "say.log", depends_on=["a"])
 
 
 def test_a_step_is_printed_logged_noted_and_done(version, tmp_path, capsys):
-    with open_runner(tmp_path) as runner:
-        runner.do(version, tmp_path, version.result)
+    run_command(version, tmp_path, version.result)
     assert capsys.readouterr().err == "$ sceneprior --version\n"
     assert version.result.read_text().startswith("sceneprior 0.")
     noted = json.loads((tmp_path / "steps.json").read_text())["say"]
     assert noted["arguments"] == ["--version"] and noted["finished"]
     assert noted["cpu_s"] > 0 and noted["wall_s"] > 0 and 0 <= noted["peak_memory_gib"] < 10
     assert is_done(version, tmp_path)
-    other = Step("say", ["--version"], version.result, depends_on=["b"])
+    other = Command("say", ["--version"], version.result, depends_on=["b"])
     assert not is_done(other, tmp_path)
     version.result.unlink()
     assert not is_done(version, tmp_path)
@@ -38,31 +42,11 @@ def test_a_step_is_printed_logged_noted_and_done(version, tmp_path, capsys):
 
 def test_a_failed_step_is_its_own_sentence_and_forgets_what_came_after(version, tmp_path):
     (tmp_path / "steps.json").write_text('{"first": {}, "fail": {}, "say": {"finished": true}}')
-    step = Step("fail", ["inspect", "nowhere"], tmp_path / "no", depends_on=[])
-    with open_runner(tmp_path) as runner, pytest.raises(InputError, match="nowhere"):
-        runner.do(step, tmp_path, tmp_path / "fail.log")
+    step = Command("fail", ["inspect", "nowhere"], tmp_path / "no", depends_on=[])
+    with pytest.raises(InputError, match="nowhere"):
+        run_command(step, tmp_path, tmp_path / "fail.log")
     noted = json.loads((tmp_path / "steps.json").read_text())
     assert list(noted) == ["first", "fail"] and not noted["fail"]["finished"]
-
-
-def test_nothing_begins_once_the_runner_is_stopped(version, tmp_path):
-    with open_runner(tmp_path) as runner:
-        with pytest.raises(KeyboardInterrupt):
-            runner.stop()
-        with pytest.raises(KeyboardInterrupt):
-            runner.do(version, tmp_path, version.result)
-    assert not (tmp_path / "steps.json").exists()
-
-
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
-def test_signals_are_answered_only_while_a_runner_is_open(tmp_path, name):
-    number = signal.Signals[name]
-    before = signal.signal(number, signal.SIG_DFL)
-    with pytest.raises(KeyboardInterrupt), open_runner(tmp_path) as runner:
-        with pytest.raises(InputError, match="Another run is writing to"), only_writer(tmp_path):
-            pass
-        signal.raise_signal(number)
-    assert runner.stopped and signal.signal(number, before) == signal.SIG_DFL
 
 
 @pytest.mark.parametrize(
@@ -77,7 +61,7 @@ def test_a_signal_stops_the_command_that_runs_and_what_it_took_is_noted(
     script.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(script))
     log = tmp_path / "log"
-    step = Step("wait", [], tmp_path / "no", depends_on=[])
+    step = Command("wait", [], tmp_path / "no", depends_on=[])
 
     def send() -> None:
         while not (log.exists() and log.read_text()):
@@ -89,9 +73,10 @@ def test_a_signal_stops_the_command_that_runs_and_what_it_took_is_noted(
     before = signal.signal(signal.SIGINT, ignored)
     sender = threading.Thread(target=send)
     try:
-        with pytest.raises(KeyboardInterrupt), open_runner(tmp_path) as runner:
-            sender.start()
-            runner.do(step, tmp_path, log)
+        sender.start()
+        with pytest.raises(KeyboardInterrupt):
+            run_command(step, tmp_path, log)
+        assert signal.getsignal(signal.SIGINT) is ignored
     finally:
         sender.join()
         signal.signal(signal.SIGINT, before)
@@ -106,8 +91,7 @@ def test_memory_is_that_of_the_largest_process(tmp_path, monkeypatch):
     shell.write_text(f'#!/bin/sh\n{sys.executable} -c "bytearray(100 << 20)"\ntrue\n')
     shell.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(shell))
-    with open_runner(tmp_path) as runner:
-        status, costs = runner.call([], None)
+    status, costs, _ = call([], None)
     # Linux counts what a process held before `exec`, which is what this one holds.
     own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     assert status == 0 and 0.1 < costs["peak_memory_gib"] < max(1, 1.1 * own)

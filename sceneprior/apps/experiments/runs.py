@@ -1,0 +1,196 @@
+"""The runs of a comparison, and the rows that each of them has in the tables."""
+
+import json
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from sceneprior.apps.config import load_config
+from sceneprior.apps.experiments.comparison import (
+    EVERY,
+    Comparison,
+    Method,
+    RoomComparison,
+    Rooms,
+    ViewComparison,
+    read_comparison,
+)
+from sceneprior.apps.reconstruction.reconstruct import OBJECTS
+from sceneprior.core.errors import ConfigError
+from sceneprior.core.settings import read_settings
+from sceneprior.lifted.config import LiftedConfig
+from sceneprior.lifted.trained import SAMPLER
+from sceneprior.paper.config import PaperConfig
+from sceneprior.training.method import RunConfig
+
+PAPER, LIFTED = "the paper's method and variations of it", "the lifted method"
+LIFTED_BOXES = "the paper's network and latents trained on lifted boxes"
+BASELINES = "baselines"
+GIVEN = "scenes as given, which were made elsewhere"
+"""Names of methods in captions, and of scenes that no method of this package made."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training with one seed, or a folder of scenes, which needs no training."""
+
+    rooms: str
+    method: str
+    seed: int | None
+    """Seed of training; None for scenes."""
+    config: str
+    settings: tuple[str, ...]
+    """Changes to the config, for `fit --set`."""
+    folder: Path
+    scenes: Path | None = None
+    """Folder of existing scenes, made by any method; None for a method to train."""
+
+    @property
+    def run_config(self) -> RunConfig:
+        """The settings of the run's training; for scenes, the config of their kind of rooms."""
+        return load_config(self.config, self.settings)
+
+    @property
+    def title(self) -> str:
+        seed = () if self.seed is None else (f"seed {self.seed}",)
+        return ", ".join((self.rooms, self.method, *seed))
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way in which a run makes rooms or reconstructions; each has a command and a table row."""
+
+    name: str | None
+    """Value of `--distribution` or `--fit`; None leaves the option out."""
+    title: str
+    """Title of the row; empty if neither the comparison nor a config gives one."""
+    made_by: str
+    """Name of the method in captions."""
+    result: Path
+    """File of the variant's scores."""
+
+
+def load_comparison(name: str) -> Comparison:
+    """Read a comparison and check the settings of each of its runs."""
+    path, comparison = read_comparison(name)
+    rows: dict[tuple[str, str], str] = {}
+    for run in runs_of(comparison, Path()):
+        for variant in variants_of(comparison, run):
+            if not (title := variant.title):
+                raise ConfigError(
+                    f"{path}: methods.{run.method} has no title; only the paper's and the "
+                    "lifted method are named by their configs."
+                )
+            if (other := rows.setdefault((run.rooms, title), run.method)) != run.method:
+                raise ConfigError(
+                    f"{path}: the title '{title}' is given twice; a title names a row, so give "
+                    f"methods.{other} or methods.{run.method} another `title`."
+                )
+    return comparison
+
+
+def runs_of(comparison: Comparison, out: Path) -> list[Run]:
+    """All runs: scenes first, then seed by seed, so that a comparison stopped early is complete for
+    fewer seeds.
+    """
+    runs = []
+    for seed in (None, *comparison.seeds):
+        for (key, rooms), (name, method) in product(
+            comparison.rooms.items(), comparison.methods.items()
+        ):
+            folder = out / key / name
+            if seed is None and key in method.scenes:
+                scenes = Path(method.scenes[key])
+                runs.append(Run(key, name, None, rooms.config, rooms.set, folder, scenes))
+            elif seed is not None and not method.scenes:
+                changes = (*method.set.get(EVERY, ()), *method.set.get(key, ()))
+                settings = (*_of_rooms(rooms, method), *changes, f"seed={seed}")
+                config = method.config or rooms.config
+                runs.append(Run(key, name, seed, config, settings, folder / f"seed{seed}"))
+    return runs
+
+
+def _of_rooms(rooms: Rooms, method: Method) -> list[str]:
+    """Settings that a method takes from its rooms: their changes to the config that both share, or
+    a few values for a config of its own."""
+    if method.config is None:
+        return list(rooms.set)
+    shared, own = read_settings(rooms.config, rooms.set)[1], read_settings(method.config)[1]
+    keys = ["label_set", "data.shards"]
+    if _value(own, "model.max_objects") is not None:
+        keys.append("model.max_objects")
+    values = {key: _value(shared, key) for key in keys}
+    # Values are quoted as JSON, which is valid YAML, so that a folder called 2024 stays a string.
+    return [f"{key}={json.dumps(v)}" for key, v in values.items() if v is not None]
+
+
+def _value(data: Any, key: str) -> Any:
+    for part in key.split("."):
+        data = data.get(part) if isinstance(data, dict) else None
+    return data
+
+
+def shards_of(comparison: Comparison, rooms: str) -> Path:
+    """The folder of shards that holds a kind of rooms."""
+    kind = comparison.rooms[rooms]
+    return Path(load_config(kind.config, kind.set).data.shards)
+
+
+def variants_of(comparison: Comparison, run: Run) -> list[Variant]:
+    """The variants of a run, in the order of their rows.
+
+    A run that keeps the latents of training rooms has one variant per distribution or fit; its
+    sampler, if it has one, comes first. Scenes and runs of other methods have a single variant.
+    """
+    title = comparison.methods[run.method].title
+    if run.scenes is not None:
+        return [Variant(None, title or "", GIVEN, run.folder / "scores.json")]
+    config, views = run.run_config, isinstance(comparison, ViewComparison)
+    names: tuple[str | None, ...] = (None,)
+    if config.remembers_rooms and isinstance(comparison, ViewComparison):
+        names = comparison.fits
+    elif config.remembers_rooms and isinstance(comparison, RoomComparison):
+        own = (None,) if getattr(config, "distribution", None) == SAMPLER else ()
+        names = (*own, *comparison.distributions)
+    found = []
+    for name in names:
+        plain, detail, made_by = (
+            reconstructed_by(config, name or OBJECTS) if views else generated_by(config, name)
+        )
+        row = plain if title is None else ", ".join(filter(None, (title, detail)))
+        file = "scores.json" if name == names[0] else f"scores_{name}.json"
+        found.append(Variant(name, row, made_by, run.folder / file))
+    return found
+
+
+def generated_by(config: RunConfig, distribution: str | None) -> tuple[str, str, str]:
+    """The method with which a run draws new rooms; if `distribution` is None, it is the run's
+    default.
+
+    Returns:
+        The title of its row, text to append to a title of the user's, and its name in captions.
+    """
+    if not isinstance(config, PaperConfig | LiftedConfig):
+        return "", "", BASELINES
+    if (distribution or config.distribution) == SAMPLER:
+        return "Lifted method: sampler", "sampler of the lifted method", LIFTED
+    if isinstance(config, LiftedConfig):
+        title = "Paper's sphere, trained on lifted boxes"
+        return title, "trained on lifted boxes", LIFTED_BOXES
+    return "Paper's method", "", PAPER
+
+
+def reconstructed_by(config: RunConfig, fit: str) -> tuple[str, str, str]:
+    """The method with which a run reconstructs rooms, as `generated_by`; `fit` is the option of
+    `eval-svr`."""
+    if not isinstance(config, PaperConfig | LiftedConfig):
+        return "", "", BASELINES
+    lifted = isinstance(config, LiftedConfig)
+    if fit == OBJECTS:
+        title = "Object by object" if lifted else "Object by object, by the paper's prior"
+        return title, "object by object", LIFTED
+    if lifted:
+        detail = "fit of a latent, trained on lifted boxes"
+        return detail.capitalize(), detail, LIFTED_BOXES
+    return "Paper: fit of a latent", "fit of a latent", PAPER

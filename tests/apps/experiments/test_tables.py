@@ -1,0 +1,117 @@
+"""Commands and tables of comparisons are as before, from result files that are made up."""
+
+from pathlib import Path
+
+import pytest
+from made_results import METHODS, write_comparison, write_new_rooms, write_views
+
+from sceneprior.apps.experiments import table
+from sceneprior.apps.experiments.compare import commands_of
+from sceneprior.apps.experiments.comparison import part_of
+from sceneprior.apps.experiments.runs import load_comparison, runs_of, variants_of
+from sceneprior.apps.experiments.table import VIEWS, Row, markdown, write_tables
+
+GOLDEN = Path(__file__).parents[2] / "golden" / "apps"
+
+
+def test_shipped_comparisons_run_the_same_commands_for_the_same_rows():
+    lines = []
+    for name, rooms in (
+        ("new_rooms", None),
+        ("paper", "bedroom,living_small"),
+        ("single_view", None),
+    ):
+        comparison = load_comparison(f"compare/{name}.yaml")
+        lines.append(f"# {name}")
+        for run in runs_of(part_of(comparison, None, rooms, "0"), Path("out")):
+            count = None if name == "single_view" else 149
+            rows = {
+                variant.result.stem: f"{variant.title} | {variant.made_by}"
+                for variant in variants_of(comparison, run)
+            }
+            lines.append(run.title)
+            for each in commands_of(comparison, run, count, Path("inception.pt"), "cpu"):
+                lines.append(f"  {each.name}: {' '.join(each.arguments)} -> {each.result}")
+                if each.name in rows:
+                    needs = " ".join(each.depends_on)
+                    lines.append(f"    row: {rows[each.name]} | depends on: {needs}")
+    assert "\n".join(lines) + "\n" == (GOLDEN / "compare_commands.txt").read_text()
+
+
+@pytest.fixture(autouse=True)
+def costs(monkeypatch):
+    """Costs of training without checkpoints; those of the GAN are unknown."""
+
+    def costs_of(run):
+        cpu_s = None if run.method == "gan" else 300 + 60.5 * (run.seed or 0)
+        costs = {"cpu_s": cpu_s, "steps": 4500, "parameters": 1_250_000}
+        return {} if run.scenes else costs
+
+    monkeypatch.setattr(table, "costs_of", costs_of)
+
+
+def assert_tables(name: str, folder: Path) -> None:
+    for ending in ("md", "csv"):
+        found = (folder / f"table.{ending}").read_text()
+        assert found == (GOLDEN / f"compare_{name}.{ending}").read_text()
+
+
+LATENTS = {None: "sampler", "paper": "paper", "kernel": "kernel, copies: near training rooms"}
+
+
+def test_tables_of_new_rooms(tmp_path):
+    config = str(tmp_path / "tiny.yaml")
+    kinds = {
+        "toy": {"title": "Toys", "config": config},
+        "more": {"title": "More toys", "config": config},
+    }
+    methods = METHODS | {
+        "lifted": {"config": str(tmp_path / "lifted.yaml")},
+        "gan": {"title": "GAN", "config": str(tmp_path / "gan.yaml")},
+        "theirs": {"title": "Theirs", "scenes": {"toy": "theirs"}},
+    }
+    path = write_comparison(tmp_path, Path("shards"), seeds=[0, 1], rooms=kinds, methods=methods)
+    comparison = load_comparison(path)
+    runs = runs_of(comparison, tmp_path / "out")
+    for number, run in enumerate(runs):
+        for k, variant in enumerate(variants_of(comparison, run)):
+            latents = "its own" if run.method == "gan" else LATENTS[variant.name]
+            write_new_rooms(
+                variant.result, 10 * number + k, None if run.scenes else latents,
+                run.method in ("paper", "lstm"),
+            )  # fmt: skip
+    write_tables(comparison, runs, tmp_path)
+    assert_tables("new_rooms", tmp_path)
+
+
+def test_tables_of_single_views(tmp_path):
+    own = ["sampler=null", "sampling.distribution=paper"]
+    methods = {
+        "usl": {"title": "USL", "config": str(tmp_path / "usl.yaml")},
+        "paper": {},
+        "lifted": {"config": str(tmp_path / "lifted.yaml"), "set": {"every": own}},
+    }
+    path = write_comparison(
+        tmp_path, Path("shards"), task="single_views", fits=["paper", "objects"], methods=methods
+    )
+    comparison = load_comparison(path)
+    runs = runs_of(comparison, tmp_path / "out")
+    for number, run in enumerate(runs):
+        for k, variant in enumerate(variants_of(comparison, run)):
+            write_views(variant.result, number + k, run.method == "usl")
+    write_tables(comparison, runs, tmp_path)
+    assert_tables("views", tmp_path)
+
+
+def test_surfaces_that_are_unknown_are_counted():
+    scores = {
+        "rooms": 3, "images": 3, "objects": 9, "with_surface": 4, "box_iou_3d": 0.5,
+        "seconds": 0.25, "nearest_room": {"box_iou_3d": 0.2}, "random_room": {},
+        "protocol": {"shards": "data/rooms", "known_model_share": None},
+    }  # fmt: skip
+    found = markdown([Row("Rooms", 0, "2D", "A", "as found", 0, scores, "baselines")], VIEWS)
+    assert (
+        "of the lifted method: none; of baselines: 'A'. 3 views of 3 test rooms of rooms" in found
+    )
+    assert ", 9 objects (4 of them with a known surface); masks," in found
+    assert "| A | as found | 0.500 | 0.250 |" in found
