@@ -27,7 +27,7 @@ from sceneprior.core.observed_image import ObservedImage, as_views, images_of_sp
 from sceneprior.core.overlaps import box_iou_3d
 from sceneprior.lifted.reconstruction.known_rooms import known_rooms, nearest_answers
 from sceneprior.paper.fit_image import SCHEDULES, fit_latents_to_images
-from sceneprior.paper.trained import TrainedPrior
+from sceneprior.paper.prior import TrainedPrior
 from sceneprior.render.offscreen import SoftwareRenderer
 
 FULL = SCHEDULES["paper"].steps

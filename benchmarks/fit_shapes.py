@@ -33,8 +33,8 @@ from sceneprior.core.views import SceneViews
 from sceneprior.lifted.lifting.dataset import LiftedDataset
 from sceneprior.lifted.lifting.shapes import ShapeGrid
 from sceneprior.lifted.looks import LookConfig
-from sceneprior.paper.losses.matching import Matches
-from sceneprior.paper.losses.shape import mask_loss
+from sceneprior.paper.losses import mask_loss
+from sceneprior.paper.matching import Matches
 from sceneprior.render.offscreen.renderer import Pinhole, SoftwareRenderer
 from sceneprior.render.silhouettes import render_silhouettes
 

@@ -33,8 +33,8 @@ from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.evaluation.metrics.overlaps import plausible_pairs, room_overlaps
 from sceneprior.paper.decode import DecodedRoom, decode_rooms
 from sceneprior.paper.interpolate import RoomPath, even_places
+from sceneprior.paper.prior import TrainedPrior
 from sceneprior.paper.sampling import sample_latents
-from sceneprior.paper.trained import TrainedPrior
 
 JUMP = 3.0
 """A jump is a step of more than this multiple of the median."""

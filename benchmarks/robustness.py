@@ -26,8 +26,8 @@ from sceneprior.core.views import SceneViews
 from sceneprior.evaluation.metrics.decoded_rooms import reconstruction_scores
 from sceneprior.paper.config import PaperConfig
 from sceneprior.paper.decode import decode_training_rooms
+from sceneprior.paper.prior import TrainedPrior
 from sceneprior.paper.stages import LayoutStage
-from sceneprior.paper.trained import TrainedPrior
 
 BASE = Path(__file__).parents[1] / "configs" / "paper/bedroom_small.yaml"
 SETTINGS = (

@@ -34,7 +34,7 @@ from sceneprior.evaluation.metrics.decoded_rooms import reconstruction_scores
 from sceneprior.evaluation.metrics.frechet import FRECHET
 from sceneprior.evaluation.metrics.mesh_metrics import f_score, sample_surface
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
-from sceneprior.paper.trained import TrainedPrior
+from sceneprior.paper.prior import TrainedPrior
 from sceneprior.render.pictures import contact_sheet
 from sceneprior.render.topdown import box_mesh, corner_view, perspective
 

@@ -23,8 +23,8 @@ from sceneprior.core.cameras import boxes_of_points
 from sceneprior.core.data.datamodule import make_loader
 from sceneprior.core.data.dataset import ViewDataset
 from sceneprior.evaluation.metrics.decoded_rooms import reconstruction_scores
-from sceneprior.paper.losses.matching import match_objects
-from sceneprior.paper.trained import TrainedPrior
+from sceneprior.paper.matching import match_objects
+from sceneprior.paper.prior import TrainedPrior
 from sceneprior.render.silhouettes import render_scene
 from sceneprior.training.fit import fit
 

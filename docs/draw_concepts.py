@@ -38,10 +38,10 @@ from sceneprior.core.views import SceneViews
 from sceneprior.paper.decode import decode_latents
 from sceneprior.paper.interpolate import interpolate
 from sceneprior.paper.latents import LatentSphere
-from sceneprior.paper.losses.matching import match_objects, matching_cost
-from sceneprior.paper.losses.shape import soft_iou
+from sceneprior.paper.losses import soft_iou
+from sceneprior.paper.matching import match_objects, matching_cost
+from sceneprior.paper.prior import TrainedPrior
 from sceneprior.paper.sampling import latent_of
-from sceneprior.paper.trained import TrainedPrior
 from sceneprior.paper.view_loss import proxy_boxes
 from sceneprior.render.pictures import contact_sheet, paint_ids, png_bytes
 from sceneprior.render.silhouettes import render_silhouettes

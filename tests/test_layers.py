@@ -87,7 +87,7 @@ OWNERS = {
     "sklearn": ["sceneprior/evaluation/", "sceneprior/lifted/sampler/stage"],
     "scipy.optimize": [
         "sceneprior/core/overlaps.py", "sceneprior/core/geometry/part_blends.py",
-        "sceneprior/paper/losses/matching.py",
+        "sceneprior/paper/matching.py",
         "sceneprior/evaluation/", "data_prep/inspection/truth_causes.py",
     ],
     "cv2": ["data_prep/readers/posed/lens.py", "sceneprior/evaluation/metrics/"],
@@ -111,7 +111,7 @@ def imports(path: Path) -> set[str]:
 
 
 def layer_of(module: str) -> str | None:
-    """`sceneprior.paper.losses.shape` -> losses; None for what is not ours."""
+    """`sceneprior.paper.losses` -> losses; None for what is not ours."""
     parts = module.split(".")
     if parts[0] == "data_prep":
         return "data_prep"

@@ -18,8 +18,8 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.observed_image import ObservedImage
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.views import DecodedScenes
+from sceneprior.paper.prior import TrainedPrior
 from sceneprior.paper.sampling import Point, latent_of
-from sceneprior.paper.trained import TrainedPrior
 from sceneprior.training.method import Trained
 
 if TYPE_CHECKING:

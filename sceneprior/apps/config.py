@@ -13,7 +13,7 @@ from sceneprior.apps.priors.packed import is_packed, read_packed, unpack
 from sceneprior.apps.priors.where import find_prior
 from sceneprior.core.errors import ConfigError, InputError
 from sceneprior.core.settings import check_settings, read_settings, shortened
-from sceneprior.paper.trained import TrainedPrior
+from sceneprior.paper.prior import TrainedPrior
 from sceneprior.training.checkpoints import find_checkpoint
 from sceneprior.training.method import RunConfig, Trained, TrainedReconstructor
 from sceneprior.training.settings import without_samples

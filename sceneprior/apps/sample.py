@@ -10,8 +10,8 @@ from sceneprior.core.threads import single_threaded
 from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.sampled import drawn_by_sampler, sample_scenes
 from sceneprior.paper.decode import decode_latents
+from sceneprior.paper.prior import TrainedPrior
 from sceneprior.paper.sampling import draw_latents, scene_names
-from sceneprior.paper.trained import TrainedPrior
 from sceneprior.training.method import Trained, TrainedReconstructor
 
 

@@ -81,7 +81,7 @@ class OneStage(lightning.LightningModule, ABC):
         A loss without a weight has weight 1. All losses are logged, and so is `logged`.
         """
         total = torch.stack([weights.get(name, 1.0) * loss for name, loss in losses.items()]).sum()
-        check_finite(total, batch)
+        check_finite(total, batch.room_ids)
         log_losses(self, losses | (logged or {}), total, max(len(batch.room_ids), 1))
         return total
 

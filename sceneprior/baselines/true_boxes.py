@@ -18,7 +18,7 @@ from sceneprior.core.errors import ShardError
 from sceneprior.core.geometry.turns import turn_boxes
 from sceneprior.core.shards import RoomGroundTruth, Shard
 from sceneprior.core.views import RoomBoxes
-from sceneprior.paper.losses.averages import share_of_batch
+from sceneprior.paper.losses import share_of_batch
 from sceneprior.training.method import TrainedSampler, ready_copy
 
 

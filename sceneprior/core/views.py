@@ -87,7 +87,7 @@ class DecodedScenes:
     sizes_m: Float[Tensor, "rooms objects 3"]
     """Full extents of the axis-aligned boxes."""
     completeness_logits: Float[Tensor, "rooms objects"]
-    """Completeness before the sigmoid; see `kept_objects` in `paper/losses/completeness.py`."""
+    """Completeness before the sigmoid; see `kept_objects` in `paper/losses.py`."""
     bevels: Float[Tensor, "rooms objects 2"] | None = None
     """Bevels of the proxy `beveled_box` (`beveled_cube` in `core/geometry/meshes.py`); None for
     rooms that were not decoded by a prior."""

@@ -32,10 +32,10 @@ from sceneprior.lifted.sampled import class_rows, drawn_by_sampler, floor_rectan
 from sceneprior.lifted.sampler.plan import Given
 from sceneprior.lifted.trained import TrainedLifted
 from sceneprior.paper.decode import decode_latents
-from sceneprior.paper.losses.layout import take
-from sceneprior.paper.losses.matching import assign
+from sceneprior.paper.losses import take
+from sceneprior.paper.matching import assign
+from sceneprior.paper.prior import TrainedPrior
 from sceneprior.paper.sampling import draw_latents
-from sceneprior.paper.trained import TrainedPrior
 
 DRAWN = 256
 """Number of sampled latents, from which the starts are chosen."""

@@ -20,9 +20,8 @@ from sceneprior.lifted.sampler.network import RoomSampler
 from sceneprior.lifted.sampler.rooms import SamplerRooms
 from sceneprior.lifted.sampler.settings import SamplerConfig
 from sceneprior.lifted.trained import SAMPLER, TrainedLifted
-from sceneprior.paper.prior import ModelConfig
+from sceneprior.paper.prior import ModelConfig, PriorConfig
 from sceneprior.paper.settings import LatentStageConfig
-from sceneprior.paper.trained import PriorConfig
 from sceneprior.paper.transformer import TransformerConfig
 from sceneprior.training.method import Stage, ready_copy
 

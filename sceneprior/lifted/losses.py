@@ -12,10 +12,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from sceneprior.core.views import DecodedScenes, LiftedRooms
-from sceneprior.paper.losses.averages import mean_of_objects
-from sceneprior.paper.losses.completeness import completeness_targets
-from sceneprior.paper.losses.layout import class_loss, take
-from sceneprior.paper.losses.matching import Matches, assign, class_cost
+from sceneprior.paper.losses import class_loss, completeness_targets, mean_of_objects, take
+from sceneprior.paper.matching import Matches, assign, class_cost
 
 PER_METRE = 1 / 6
 """Weight of a metre: the share of the image's width that 1 m spans at a distance of 3 m and a field
@@ -65,7 +63,7 @@ def lifted_losses(
     predicted = take(predicted_boxes(scenes), matches.prediction, dim=1)
     apart = (predicted - rooms.boxes_m).abs().sum(dim=-1)
     return {
-        "class": class_loss(scenes, rooms, matches),
+        "class": class_loss(scenes, rooms.object_class, matches),
         "box": mean_of_objects(PER_METRE * apart, matches.valid),
         "completeness": mean_of_objects(every, needed_predictions(rooms, logits.shape[1])),
     }

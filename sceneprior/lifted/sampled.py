@@ -20,7 +20,7 @@ from sceneprior.lifted.sampler.draw import draw_rooms
 from sceneprior.lifted.sampler.frames import side_of
 from sceneprior.lifted.sampler.plan import Given
 from sceneprior.lifted.trained import SAMPLER, TrainedLifted
-from sceneprior.paper.trained import TrainedPrior
+from sceneprior.paper.prior import TrainedPrior
 
 
 def drawn_by_sampler(trained: TrainedPrior, distribution: str | None) -> TrainedLifted | None:

@@ -15,7 +15,7 @@ from sceneprior.lifted.losses import (
     shape_code_loss,
 )
 from sceneprior.paper.stages import LatentStage
-from sceneprior.training.steps import batch_seed, full_precision
+from sceneprior.training.steps import batch_seed, check_finite, full_precision
 
 
 class LiftedStage(LatentStage):
@@ -38,7 +38,7 @@ class LiftedStage(LatentStage):
     def training_step(self, rooms: LiftedRooms, batch_idx: int) -> Tensor:
         slots = min(rooms.is_object.shape[1] + 1, self.prior.max_objects)
         wanted = needed_predictions(rooms, slots)
-        scenes = self.prior.decode(self.room_latents(rooms, batch_idx), False, wanted)
+        scenes = self.prior.decode(self.room_latents(rooms.room_index, batch_idx), False, wanted)
         with full_precision(self.device):
             matches = match_lifted(scenes, rooms, self.loss.match_box)
             losses = lifted_losses(scenes, rooms, matches, self.completeness_target)
@@ -51,4 +51,6 @@ class LiftedStage(LatentStage):
                 generator = torch.Generator().manual_seed(seed)
                 space = self.prior.latent_space
                 losses["latents"] = latent_loss(self.latents.weight, space.shift_free, generator)
-            return self.total(losses, rooms)
+            total = self.total(losses, len(rooms.room_index))
+            check_finite(total, rooms.room_ids)
+            return total

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from sceneprior.lifted.sampler.network import RoomSampler
-from sceneprior.paper.trained import TrainedPrior
+from sceneprior.paper.prior import TrainedPrior
 
 SAMPLER = "sampler"
 """Name of the distribution that draws rooms object by object with the sampler, without a latent."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 from torch import nn
 
 from sceneprior.core.data.dataset import ViewDataset
-from sceneprior.paper.prior import ModelConfig
+from sceneprior.paper.prior import ModelConfig, PriorConfig
 from sceneprior.paper.settings import (
     LayoutConfig,
     LossConfig,
@@ -16,7 +16,6 @@ from sceneprior.paper.settings import (
     StageConfig,
 )
 from sceneprior.paper.shape_decoder import ShapeDecoderConfig
-from sceneprior.paper.trained import PriorConfig
 from sceneprior.paper.transformer import TransformerConfig
 from sceneprior.training.method import Stage
 from sceneprior.training.settings import ViewDataConfig

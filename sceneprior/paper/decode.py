@@ -12,9 +12,8 @@ from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.threads import single_threaded
 from sceneprior.core.views import DecodedScenes
-from sceneprior.paper.losses.completeness import kept_objects
-from sceneprior.paper.prior import ScenePrior
-from sceneprior.paper.trained import TrainedPrior, with_training_latents
+from sceneprior.paper.losses import kept_objects
+from sceneprior.paper.prior import ScenePrior, TrainedPrior, with_training_latents
 from sceneprior.training.method import Trained
 
 BATCH = 64

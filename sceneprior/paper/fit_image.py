@@ -10,11 +10,11 @@ from torch import Tensor
 from sceneprior.core.errors import InputError
 from sceneprior.core.observed_image import rows_of
 from sceneprior.core.views import DecodedScenes, SceneViews
-from sceneprior.paper.losses.matching import Matches
-from sceneprior.paper.losses.shape import mask_loss
-from sceneprior.paper.trained import TrainedPrior
+from sceneprior.paper.losses import mask_loss
+from sceneprior.paper.matching import Matches
+from sceneprior.paper.prior import TrainedPrior
 from sceneprior.paper.view_loss import match_and_score, seen_boxes, seen_masks
-from sceneprior.training.steps import check_finite, weighted_sum
+from sceneprior.training.steps import weighted_sum
 
 CHECK_EVERY = 20
 """Steps between two checks of which images have converged."""
@@ -107,8 +107,6 @@ def view_loss(
     if not masks or scenes.vertices_m is None or faces is None or drawing is None:
         return ViewLoss(total, total.detach(), torch.zeros_like(total), matches)
     layout = total.detach()
-    # Checked before rendering, whose own error for vertices that are not finite names no image.
-    check_finite(layout.sum(), views)
     seen = seen_masks(scenes.vertices_m, faces, views, drawing)
     mask, overlap = mask_loss(seen, views, matches, weights.iou_gate, per_room=True)
     score = layout + weights.mask * (1 - overlap["mask_iou"])
@@ -148,7 +146,6 @@ def fit_latents_to_images(
         x = points[active].requires_grad_()
         scenes = decode_images(trained, x, seen, with_grids=False)
         loss = view_loss(trained, scenes, seen, masks)
-        check_finite(loss.total.sum(), seen)
         gains = loss.score < best[active] * (1 - schedule.least_gain)
         stalled[active] = torch.where(gains, 0, stalled[active] + 1)
         better = active[loss.score < best[active]]

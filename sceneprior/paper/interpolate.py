@@ -19,8 +19,8 @@ from sceneprior.core.scene import Scene
 from sceneprior.core.threads import single_threaded
 from sceneprior.core.views import DecodedScenes
 from sceneprior.paper.decode import DecodedRoom, decode_rooms, kept_predictions
+from sceneprior.paper.prior import TrainedPrior
 from sceneprior.paper.sampling import Point, latent_of
-from sceneprior.paper.trained import TrainedPrior
 from sceneprior.render.pictures import contact_sheet, gif_bytes, png_bytes
 from sceneprior.render.topdown import corner_view, perspective
 

@@ -10,7 +10,6 @@ from torch.nn import functional as F
 
 from sceneprior.core.classes import VOID
 from sceneprior.paper.layers import mlp
-from sceneprior.paper.released import SeparateHeads
 
 INITIAL_SIZE_M = 0.7
 """Edge of every box before training."""
@@ -37,6 +36,37 @@ class JointHead(nn.Sequential):
         """Weights and bias of each output of the last layer, in the order of the outputs."""
         last: nn.Linear = self[-1]  # type: ignore[assignment]
         return list(zip(last.weight, last.bias, strict=True))
+
+
+class SeparateHeads(nn.Module):
+    """Replacement of MLP2: a linear layer for the classes and a separate MLP for each coordinate.
+
+    `hidden` is the size of MLP1's output and of each coordinate's hidden layer.
+    """
+
+    def __init__(self, hidden: int, classes: int):
+        super().__init__()
+        self.classes = nn.Linear(hidden, classes)
+        self.coordinates = nn.ModuleList(
+            mlp(nn.Linear(hidden, hidden), nn.Linear(hidden, 1))
+            for _ in ("x", "y", "z", "width", "height", "depth")
+        )
+        self.completeness = nn.Linear(hidden, 1)
+
+    def forward(
+        self, shared: Float[Tensor, "rooms objects hidden"]
+    ) -> Float[Tensor, "rooms objects outputs"]:
+        """Class logits, x, y, z, width, height, depth and completeness, in the order of
+        `JointHead`."""
+        x = F.relu(shared)
+        parts = [self.classes(x), *(head(x) for head in self.coordinates), self.completeness(x)]
+        return torch.cat(parts, dim=-1)
+
+    def rows(self) -> list[tuple[Tensor, Tensor]]:
+        """Weights and bias of each output of the last layers, in the order of the outputs."""
+        coordinates = (head[-1] for head in self.coordinates)  # type: ignore[index]
+        last = (self.classes, *coordinates, self.completeness)
+        return [row for layer in last for row in zip(layer.weight, layer.bias, strict=True)]
 
 
 class LayoutDecoder(nn.Module):

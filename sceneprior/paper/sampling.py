@@ -18,7 +18,7 @@ from sceneprior.core.files import write_whole
 from sceneprior.core.scene import Scene
 from sceneprior.core.seeds import check_seed
 from sceneprior.paper.latents import LatentSpace
-from sceneprior.paper.trained import SHIPPED_WITH_LATENTS, TrainedPrior
+from sceneprior.paper.prior import SHIPPED_WITH_LATENTS, TrainedPrior
 
 BANDWIDTH = 0.15
 """Bandwidth of the kernel distribution, in standard deviations of the training rooms' logits: 0

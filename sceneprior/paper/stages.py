@@ -5,14 +5,14 @@ from typing import Any, ClassVar
 
 import lightning
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from sceneprior.core.settings import Section
-from sceneprior.core.views import LiftedRooms, SceneViews
-from sceneprior.paper.losses.shape import mask_loss
+from sceneprior.core.views import SceneViews
+from sceneprior.paper.losses import mask_loss
 from sceneprior.paper.prior import ScenePrior
 from sceneprior.paper.settings import (
     LatentStageConfig,
@@ -25,7 +25,6 @@ from sceneprior.paper.settings import (
 from sceneprior.paper.view_loss import match_and_score, proxy_boxes, seen_boxes, seen_masks
 from sceneprior.training.steps import (
     batch_seed,
-    check_finite,
     full_precision,
     log_losses,
     weighted_sum,
@@ -72,7 +71,7 @@ class LatentStage(lightning.LightningModule, ABC):
         """The loss of a batch."""
 
     def room_latents(
-        self, views: SceneViews | LiftedRooms, batch_idx: int
+        self, room_index: Int[Tensor, " rooms"], batch_idx: int
     ) -> Float[Tensor, "rooms width"]:
         """The rooms' latents z, each moved by a random step whose length the stage's settings
         `latent_noise` and `latent_noise_end` determine."""
@@ -81,21 +80,16 @@ class LatentStage(lightning.LightningModule, ABC):
         done = self.current_epoch / stage.epochs
         noise = stage.latent_noise + done * (end - stage.latent_noise)
         with full_precision(self.device):
-            z = space(self.latents(views.room_index))
+            z = space(self.latents(room_index))
             if not noise:
                 return z
             return space.step(z, noise, batch_seed(self.seed, self.trainer, batch_idx))
 
-    def total(
-        self,
-        losses: dict[str, Tensor],
-        views: SceneViews | LiftedRooms,
-        beside: dict[str, Tensor] | None = None,
-    ) -> Tensor:
-        """The weighted sum of the losses, checked and logged; `beside` is logged, not summed."""
+    def total(self, losses: dict[str, Tensor], rooms: int, **beside: Tensor) -> Tensor:
+        """The weighted sum of the losses of a batch of `rooms`, logged; `beside` is logged, not
+        summed."""
         total = weighted_sum(losses, self.loss)
-        check_finite(total, views)
-        log_losses(self, losses | (beside or {}), total, len(views.room_index))
+        log_losses(self, losses | beside, total, rooms)
         return total
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
@@ -130,11 +124,11 @@ class LayoutStage(LatentStage):
         return bool(stage.proxy == "beveled_box")
 
     def training_step(self, views: SceneViews, batch_idx: int) -> Tensor:
-        scenes = self.prior.decode(self.room_latents(views, batch_idx), with_shape=False)
+        scenes = self.prior.decode(self.room_latents(views.room_index, batch_idx), False)
         with full_precision(self.device):
             boxes = proxy_boxes(scenes, views, self.stage.proxy)
             losses, _ = match_and_score(scenes, boxes, views, self.loss, self.completeness_target)
-            return self.total(losses, views)
+            return self.total(losses, len(views.room_index))
 
 
 class ShapeStage(LatentStage):
@@ -149,17 +143,15 @@ class ShapeStage(LatentStage):
 
     def training_step(self, views: SceneViews, batch_idx: int) -> Tensor:
         # In a room of n objects, only the first n predictions are matched and rendered.
-        scenes = self.prior.decode(self.room_latents(views, batch_idx), views.is_object)
+        z = self.room_latents(views.room_index, batch_idx)
+        scenes = self.prior.decode(z, views.is_object)
         with full_precision(self.device):
             boxes = seen_boxes(scenes, views, self.stage)
             losses, matches = match_and_score(
                 scenes, boxes, views, self.loss, self.completeness_target
             )
-            # Checked before rendering as well, because the renderer's own error for vertices that
-            # are not finite names no room.
-            check_finite(weighted_sum(losses, self.loss), views)
             faces = self.prior.faces
             assert scenes.vertices_m is not None and faces is not None, "masks are of meshes"
             masks = seen_masks(scenes.vertices_m, faces, views, self.stage)
             losses["mask"], overlap = mask_loss(masks, views, matches, self.loss.iou_gate)
-            return self.total(losses, views, beside=overlap)
+            return self.total(losses, len(views.room_index), **overlap)

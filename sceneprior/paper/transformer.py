@@ -9,9 +9,13 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from sceneprior.paper.layers import DecoderConfig, dropout
-from sceneprior.paper.released import QuerySelfAttention, StepOutputs
-from sceneprior.paper.repeated_linear import RepeatedLinear
+from sceneprior.paper.layers import (
+    DecoderConfig,
+    QuerySelfAttention,
+    RepeatedLinear,
+    StepOutputs,
+    dropout,
+)
 
 Layer = Callable[[Tensor], Tensor]
 

@@ -10,10 +10,11 @@ from sceneprior.core.cameras import Boxes2D, boxes_of_points
 from sceneprior.core.geometry.ellipsoids import boxes_of_ellipsoids
 from sceneprior.core.geometry.meshes import beveled_cube, place
 from sceneprior.core.views import DecodedScenes, SceneViews
-from sceneprior.paper.losses.layout import layout_losses
-from sceneprior.paper.losses.matching import Matches, match_objects
+from sceneprior.paper.losses import layout_losses
+from sceneprior.paper.matching import Matches, match_objects
 from sceneprior.paper.settings import LossConfig, ShapeConfig
 from sceneprior.render.silhouettes.render import render_silhouettes
+from sceneprior.training.steps import check_finite, weighted_sum
 
 
 def proxy_boxes(scenes: DecodedScenes, views: SceneViews, proxy: str) -> Boxes2D:
@@ -61,12 +62,17 @@ def match_and_score(
 ) -> tuple[dict[str, Float[Tensor, "*rooms"]], Matches]:
     """Match predictions to tracked objects by class and 2D box, and compute the layout losses.
 
-    `per_room` is explained in `layout_losses`.
+    `per_room` is explained in `layout_losses`. The losses are checked here, before anything is
+    rendered, since the renderer's own error for vertices that are not finite names no room.
+
+    Raises:
+        FloatingPointError: the weighted sum of the losses is not finite.
     """
     matches = match_objects(scenes, boxes, views, weights.match_box, weights.occlusion_slack)
     losses = layout_losses(
         scenes, boxes, views, matches, weights.occlusion_slack, completeness_target, per_room
     )
+    check_finite(weighted_sum(losses, weights).detach().sum(), views.room_ids)
     return losses, matches
 
 

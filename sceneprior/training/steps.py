@@ -11,7 +11,6 @@ from torch import Tensor
 from torch import distributed as dist
 
 from sceneprior.core.settings import Section
-from sceneprior.core.views import LiftedRooms, RoomBoxes, SceneViews
 
 if TYPE_CHECKING:  # importing Lightning takes longer than the rest of loading a prior
     import lightning.pytorch.utilities.types
@@ -30,14 +29,14 @@ def weighted_sum(
     return torch.stack([by_name[name] * loss for name, loss in losses.items()]).sum(dim=0)
 
 
-def check_finite(total: Tensor, views: SceneViews | LiftedRooms | RoomBoxes) -> None:
+def check_finite(total: Tensor, room_ids: tuple[str, ...]) -> None:
     """Raise a `FloatingPointError` that names the batch's rooms if the total loss is not finite.
 
     All processes stop together: if one stopped alone, the others would wait for it.
     """
     value = total.item()
     finite = math.isfinite(value)
-    told = [(value, () if finite else views.room_ids)]
+    told = [(value, () if finite else room_ids)]
     if dist.is_available() and dist.is_initialized():
         worst = torch.tensor(int(finite), device=total.device)
         dist.all_reduce(worst, dist.ReduceOp.MIN)

@@ -23,7 +23,7 @@ from sceneprior.lifted.complete import (
     repeated,
 )
 from sceneprior.paper.latents import LatentSphere
-from sceneprior.paper.losses.completeness import kept_objects
+from sceneprior.paper.losses import kept_objects
 from sceneprior.paper.prior import ScenePrior
 from sceneprior.paper.sampling import draw_latents
 

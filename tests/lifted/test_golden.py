@@ -19,8 +19,8 @@ from sceneprior.lifted.reconstruction.objects import answer_images
 from sceneprior.lifted.trained import TrainedLifted
 from sceneprior.paper.fit_image import FitSchedule, fit_latents_to_images
 from sceneprior.paper.interpolate import interpolate
-from sceneprior.paper.losses.shape import mask_loss
-from sceneprior.paper.trained import TrainedPrior
+from sceneprior.paper.losses import mask_loss
+from sceneprior.paper.prior import TrainedPrior
 from sceneprior.paper.view_loss import match_and_score, seen_boxes, seen_masks
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "learning.json"

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from sceneprior.paper.repeated_linear import RepeatedLinear
+from sceneprior.paper.layers import RepeatedLinear
 
 ROWS = (2, 0, 5, 3)
 

@@ -158,7 +158,7 @@ def test_ctrl_c_before_training_does_not_speak_of_a_run(toy_shards, tmp_path, mo
     def stop(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sceneprior.paper.trained.ViewDataset", stop)
+    monkeypatch.setattr("sceneprior.paper.prior.ViewDataset", stop)
     config = write_tiny_config(tmp_path / "tiny.yaml", toy_shards)
     result = CliRunner().invoke(app, ["fit", "--config", str(config), "--run", str(tmp_path / "r")])
     assert result.exit_code == 130

@@ -35,7 +35,7 @@ def pack(
     from sceneprior.apps.priors.packed import write_packed
     from sceneprior.core.files import read_json
     from sceneprior.lifted.trained import SAMPLER
-    from sceneprior.paper.trained import TrainedPrior
+    from sceneprior.paper.prior import TrainedPrior
 
     if out.exists() and (out.is_dir() or not overwrite):
         raise InputError(f"{out} already exists; name another file, or add --overwrite.")

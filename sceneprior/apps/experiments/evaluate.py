@@ -25,8 +25,8 @@ from sceneprior.evaluation.room_sets import seeded_rows
 from sceneprior.evaluation.synthesis import FORMAT, EvalOptions, evaluate_synthesis
 from sceneprior.evaluation.use import UseOptions, evaluate_use
 from sceneprior.paper.decode import decode_latents, decode_training_rooms
+from sceneprior.paper.prior import TrainedPrior
 from sceneprior.paper.sampling import marked
-from sceneprior.paper.trained import TrainedPrior
 from sceneprior.render.scene_files import load_scene_folder
 from sceneprior.training.method import Trained, TrainedSampler
 

@@ -28,9 +28,9 @@ from sceneprior.evaluation.metrics.overlaps import room_overlaps
 from sceneprior.evaluation.registry import METRICS
 from sceneprior.evaluation.synthesis import EvalOptions, result_of
 from sceneprior.paper.config import PaperConfig
-from sceneprior.paper.losses.matching import match_objects
+from sceneprior.paper.matching import match_objects
+from sceneprior.paper.prior import TrainedPrior
 from sceneprior.paper.shape_decoder import ShapeDecoder
-from sceneprior.paper.trained import TrainedPrior
 from sceneprior.render.silhouettes.render import render_scene
 
 VIEWS = 4

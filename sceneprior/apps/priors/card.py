@@ -12,7 +12,7 @@ from sceneprior.core.files import read_json
 from sceneprior.core.shards import INDEX_NAME
 from sceneprior.evaluation.score_table import headings, score_rows
 from sceneprior.lifted.trained import TrainedLifted
-from sceneprior.paper.trained import TrainedPrior
+from sceneprior.paper.prior import TrainedPrior
 from sceneprior.training.method import Trained
 
 UNSTATED = (

@@ -30,7 +30,7 @@ from sceneprior.core.geometry.turns import QUARTERS
 from sceneprior.core.parts import KINDS
 from sceneprior.core.settings import Section, check_settings
 from sceneprior.lifted.trained import TrainedLifted
-from sceneprior.paper.trained import TrainedPrior
+from sceneprior.paper.prior import TrainedPrior
 from sceneprior.training.method import RunConfig, Trained
 
 FORMAT = "sceneprior-prior"

@@ -18,7 +18,7 @@ from sceneprior.core.views import SceneViews
 from sceneprior.lifted.reconstruction.objects import answer_images
 from sceneprior.paper.decode import scene_of
 from sceneprior.paper.fit_image import SCHEDULES, fit_latents_to_images, refuse_crowds, view_loss
-from sceneprior.paper.trained import TrainedPrior, with_training_latents
+from sceneprior.paper.prior import TrainedPrior, with_training_latents
 from sceneprior.training.method import Trained, TrainedReconstructor
 
 BATCH = 128

@@ -22,8 +22,8 @@ from sceneprior.lifted.looks import LookDecoder
 from sceneprior.lifted.trained import SAMPLER, TrainedLifted
 from sceneprior.paper.decode import decode_latents, to_rooms
 from sceneprior.paper.interpolate import RoomPath, even_places
+from sceneprior.paper.prior import TrainedPrior, with_training_latents
 from sceneprior.paper.sampling import DISTRIBUTIONS, named_latent
-from sceneprior.paper.trained import TrainedPrior, with_training_latents
 
 PATH_STEPS = 49
 """Number of rooms of a path with both ends; neighbours are rarely more than 4 degrees apart."""

@@ -31,9 +31,8 @@ from sceneprior.baselines.gan.semantic_maps import (
 from sceneprior.core.data.dataset import ViewDataset
 from sceneprior.core.views import DecodedScenes, SceneViews
 from sceneprior.paper.layout_decoder import LayoutDecoder
-from sceneprior.paper.prior import ModelConfig
+from sceneprior.paper.prior import ModelConfig, PriorConfig
 from sceneprior.paper.shape_decoder import ShapeDecoderConfig
-from sceneprior.paper.trained import PriorConfig
 from sceneprior.paper.transformer import TransformerConfig
 from sceneprior.training.method import Stage
 from sceneprior.training.settings import TrainConfig
@@ -157,7 +156,7 @@ class GanStage(lightning.LightningModule):
         with full_precision(self.device):
             # This is checked before rendering, which rejects vertices that are not finite.
             undecided = logit_penalty(scenes)
-            check_finite(undecided + scenes.centers_m.sum() + scenes.sizes_m.sum(), views)
+            check_finite(undecided + scenes.centers_m.sum() + scenes.sizes_m.sum(), views.room_ids)
             real = observed_maps(views, self.classes)
             fake, counts = self._draw(scenes, views)
             more = contents(fake, counts) - contents(real, observed_counts(views, self.classes))
@@ -178,7 +177,7 @@ class GanStage(lightning.LightningModule):
 
         self.discriminator.requires_grad_(False)
         loss = loss + adversarial_loss(self.discriminator(fake), real=True)
-        check_finite(loss, views)
+        check_finite(loss, views.room_ids)
         self._update(generator_optimizer, loss)
         self.discriminator.requires_grad_(True)
         self.average(list(self.prior.parameters()), list(self.generator.parameters()), 0)

@@ -11,7 +11,7 @@ from sceneprior.baselines.one_stage import OneStage, OneStageTraining
 from sceneprior.baselines.set_flow.network import NUMBERS, PARTS, SetFlow, SetFlowModel
 from sceneprior.baselines.true_boxes import BoxConfig, room_means
 from sceneprior.core.views import RoomBoxes
-from sceneprior.paper.losses.matching import assign
+from sceneprior.paper.matching import assign
 from sceneprior.training.steps import full_precision
 
 

@@ -12,9 +12,8 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.geometry.meshes import beveled_cube, icosphere
 from sceneprior.core.views import DecodedScenes
 from sceneprior.lifted.looks import LookDecoder
-from sceneprior.paper.losses.completeness import kept_objects
-from sceneprior.paper.prior import ScenePrior
-from sceneprior.paper.trained import TrainedPrior
+from sceneprior.paper.losses import kept_objects
+from sceneprior.paper.prior import ScenePrior, TrainedPrior
 
 ROOMS = 64
 """Rooms decoded at a time."""

@@ -26,7 +26,7 @@ from sceneprior.core.observed_image import ObservedImage, as_views, rows_of
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.core.shards import Shard, iterate_rooms
 from sceneprior.core.views import DecodedScenes
-from sceneprior.paper.losses.matching import match_objects, matching_cost
+from sceneprior.paper.matching import match_objects, matching_cost
 from sceneprior.render.offscreen import Renderer
 from sceneprior.render.topdown import scene_meshes
 

@@ -28,7 +28,7 @@ from sceneprior.lifted.reconstruction.known_rooms import turn_object
 from sceneprior.lifted.reconstruction.outlines import Outlines, outlines_of
 from sceneprior.lifted.reconstruction.placing import Placed, place_objects
 from sceneprior.paper.decode import scene_of
-from sceneprior.paper.trained import TrainedPrior
+from sceneprior.paper.prior import TrainedPrior
 
 OF_CLASS = 200
 """Number of candidates per class, chosen with a fixed seed."""

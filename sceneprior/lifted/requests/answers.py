@@ -17,8 +17,8 @@ from sceneprior.lifted.requests.relation_checks import RelationChecks, furniture
 from sceneprior.lifted.requests.request import Request, make_request
 from sceneprior.lifted.sampled import drawn_by_sampler, scene_of
 from sceneprior.lifted.trained import TrainedLifted
+from sceneprior.paper.prior import TrainedPrior
 from sceneprior.paper.sampling import scene_names
-from sceneprior.paper.trained import TrainedPrior
 
 
 @single_threaded()

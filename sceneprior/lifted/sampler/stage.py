@@ -21,7 +21,7 @@ from sceneprior.lifted.sampler.network import RECTANGLES, RoomSampler
 from sceneprior.lifted.sampler.rooms import SYMMETRIES, SamplerRooms, frames_of, turned_rooms
 from sceneprior.lifted.sampler.settings import SamplerConfig
 from sceneprior.lifted.sampler.sizes import find_sizes
-from sceneprior.paper.losses.averages import share_of_batch
+from sceneprior.paper.losses import share_of_batch
 from sceneprior.paper.prior import ScenePrior
 from sceneprior.training.steps import (
     batch_seed,
@@ -84,7 +84,7 @@ class SamplerStage(lightning.LightningModule):
             share = share_of_batch(taught.sum()) / max(int(taught.sum()), 1)
             means = {name: (part * taught).sum() * share for name, part in parts.items()}
             total = torch.stack(list(means.values())).sum()
-        check_finite(total, rooms)
+        check_finite(total, rooms.room_ids)
         log_losses(self, means, total, len(rooms.boxes_m))
         return total
 

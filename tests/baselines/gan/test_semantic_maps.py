@@ -21,7 +21,7 @@ from sceneprior.core.data.dataset import ViewDataset
 from sceneprior.core.geometry.meshes import place
 from sceneprior.core.shards import iterate_rooms
 from sceneprior.core.views import DecodedScenes
-from sceneprior.paper.losses.completeness import kept_objects
+from sceneprior.paper.losses import kept_objects
 
 CLASSES = 22
 BOX = trimesh.creation.box()

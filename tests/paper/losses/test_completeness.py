@@ -7,7 +7,7 @@ import torch
 from torch.testing import assert_close
 
 from sceneprior.baselines.gan.semantic_maps import kept_share
-from sceneprior.paper.losses.completeness import completeness_targets, kept_objects
+from sceneprior.paper.losses import completeness_targets, kept_objects
 from sceneprior.paper.prior import ModelConfig
 
 CONVENTIONS = ModelConfig.model_fields["completeness_target"].annotation.__args__

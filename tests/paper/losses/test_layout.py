@@ -8,7 +8,7 @@ from references import losses as by_hand
 
 from sceneprior.core.cameras import boxes_of_points
 from sceneprior.core.geometry.corners import box_corners
-from sceneprior.paper.losses.layout import (
+from sceneprior.paper.losses import (
     box_loss,
     class_loss,
     completeness_loss,
@@ -16,7 +16,7 @@ from sceneprior.paper.losses.layout import (
     layout_losses,
     take,
 )
-from sceneprior.paper.losses.matching import Matches, match_objects
+from sceneprior.paper.matching import Matches, match_objects
 
 OVERSHOOT = (1.0, 0.3)
 
@@ -104,7 +104,7 @@ def test_every_layout_term_passes_gradcheck(batch):
         return frustum_loss(take(centers, matches.prediction, 1), views, seen)
 
     def classes(logits):
-        return class_loss(replace(batch.scenes, class_logits=logits), views, matches)
+        return class_loss(replace(batch.scenes, class_logits=logits), views.object_class, matches)
 
     def completeness(logits):
         return completeness_loss(replace(batch.scenes, completeness_logits=logits), views)

@@ -7,7 +7,7 @@ import torch
 from references.losses import best_assignment, pair_cost
 from torch.testing import assert_close
 
-from sceneprior.paper.losses.matching import match_objects, matching_cost
+from sceneprior.paper.matching import match_objects, matching_cost
 
 OVERSHOOT = (1.0, 0.3, 0.0)
 

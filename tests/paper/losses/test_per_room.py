@@ -8,10 +8,8 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from sceneprior.core.cameras import Boxes2D
-from sceneprior.paper.losses.averages import mean_of_objects
-from sceneprior.paper.losses.layout import layout_losses
-from sceneprior.paper.losses.matching import Matches, match_objects
-from sceneprior.paper.losses.shape import mask_loss
+from sceneprior.paper.losses import layout_losses, mask_loss, mean_of_objects
+from sceneprior.paper.matching import Matches, match_objects
 
 
 def only(thing, room: int):

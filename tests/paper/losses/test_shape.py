@@ -6,8 +6,8 @@ import pytest
 import torch
 from references import losses as by_hand
 
-from sceneprior.paper.losses.matching import match_objects
-from sceneprior.paper.losses.shape import mask_loss
+from sceneprior.paper.losses import mask_loss
+from sceneprior.paper.matching import match_objects
 
 
 def masks(batch, seed=0, sharp=1.0):
