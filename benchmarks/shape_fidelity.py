@@ -35,8 +35,9 @@ from sceneprior.evaluation.metrics.frechet import FRECHET
 from sceneprior.evaluation.metrics.mesh_metrics import f_score, sample_surface
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
 from sceneprior.paper.prior import TrainedPrior
+from sceneprior.render.appearance import box_mesh
 from sceneprior.render.pictures import contact_sheet
-from sceneprior.render.topdown import box_mesh, corner_view, perspective
+from sceneprior.render.topdown import corner_view, perspective
 
 SPHERE_LEVEL = 3
 SOLID_CELLS, SOLID_POINTS = 32, 50_000

@@ -16,7 +16,7 @@ from sceneprior.core.scene_json import FORMAT
 from sceneprior.core.shell import ShellName
 from sceneprior.paper.sampling import LATENTS_FILE, write_latents
 from sceneprior.render.pictures import contact_sheet, png_bytes
-from sceneprior.render.scene_files import check_names, format_of, save_scene
+from sceneprior.render.scene_files import check_names, format_of, save
 from sceneprior.render.topdown import perspective, view_of
 
 PAGE_FILE = "rooms.html"
@@ -26,12 +26,12 @@ OVERVIEW_TILE = (240, 320)
 
 
 def write_scene(scene: Scene, folder: Path, name: str, shell: ShellName = "none") -> None:
-    """Write `<name>.glb`, `<name>.png` and `<name>.json`; see `save_scene`.
+    """Write `<name>.glb`, `<name>.png` and `<name>.json`; see `save`.
 
     The JSON is written last, so that a JSON implies that the other two files exist.
     """
     for ending in (".glb", ".png", ".json"):
-        save_scene(scene, Path(folder) / f"{name}{ending}", shell)
+        save(scene, Path(folder) / f"{name}{ending}", shell)
 
 
 def clear_scenes(folder: Path) -> None:

@@ -1,12 +1,8 @@
 """A room as 3D objects with its floor, doors and windows; `scene_json` has its file format."""
 
-import base64
-import html
-import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -109,6 +105,16 @@ class SceneObject:
         object.__setattr__(self, "center_m", _triple(self.center_m))
         object.__setattr__(self, "size_m", _triple(self.size_m))
 
+    @property
+    def facing(self) -> dict[str, float]:
+        """Entries `yaw_rad` and `yaw_confidence` of files, if the object's orientation is known."""
+        if self.turned is None:
+            return {}
+        entries = {"yaw_rad": round(self.turned.yaw_rad, 7)}
+        if self.turned.confidence < 1:
+            entries["yaw_confidence"] = round(self.turned.confidence, 3)
+        return entries
+
     def in_box(self, center_m: Sequence[float], size_m: Sequence[float]) -> "SceneObject":
         """Copy of the object in another box; mesh and solids are moved and scaled accordingly."""
         center, size = _triple(center_m), _triple(size_m)
@@ -207,10 +213,10 @@ class Scene:
         >>> Scene("empty", "front3d_bedroom")
         Scene('empty', front3d_bedroom: no objects)
         """
-        return f"Scene({self.name!r}, {self.label_set}: {self._contents})"
+        return f"Scene({self.name!r}, {self.label_set}: {self.contents})"
 
     @property
-    def _contents(self) -> str:
+    def contents(self) -> str:
         """The classes of the objects, most frequent first, with their numbers."""
         counted = Counter(item.label for item in self.objects).most_common()
         words = [label if count == 1 else f"{label} ×{count}" for label, count in counted]
@@ -236,51 +242,3 @@ class Scene:
         """Copy of the scene in which objects are only boxes, for methods without meshes."""
         bare = (replace(item, mesh=None, solids=(), textured=()) for item in self.objects)
         return replace(self, objects=tuple(bare))
-
-    def save(self, path: Path | str) -> None:
-        """Write the scene to a file: `.json`, `.glb`, `.obj`, `.usda` or `.png`; see `save_scene`.
-
-        >>> from tempfile import TemporaryDirectory
-        >>> bed = SceneObject("double_bed", (0.0, 0.3, 0.0), (1.8, 0.6, 2.0))
-        >>> with TemporaryDirectory() as folder:
-        ...     Scene("mine", "front3d_bedroom", (bed,)).save(f"{folder}/mine.glb")
-        ...     Path(f"{folder}/mine.glb").read_bytes()[:4]
-        b'glTF'
-        """
-        from sceneprior.render.scene_files import save_scene
-
-        save_scene(self, Path(path))
-
-    def picture(self) -> np.ndarray:
-        """Render the room shaded, from above a corner, (360, 480, 3) uint8; not for evaluation.
-
-        >>> Scene("empty", "front3d_bedroom").picture().shape
-        (360, 480, 3)
-        """
-        from sceneprior.render.topdown import perspective
-
-        return perspective(self)
-
-    def show(self) -> None:
-        """Display the scene in a notebook, from any line of a cell; elsewhere an `InputError`."""
-        notebook = sys.modules.get("IPython")
-        if notebook is None or notebook.get_ipython() is None:
-            raise InputError(
-                "Scene.show() draws in a notebook, and this is none; scene.save('room.png') writes "
-                "a picture, and 'room.glb' a model."
-            )
-        notebook.display.display(self)
-
-    def _repr_html_(self) -> str:
-        """HTML for notebooks: a picture of the scene and its number of objects per class.
-
-        >>> "no objects" in Scene("empty", "front3d_bedroom")._repr_html_()
-        True
-        """
-        from sceneprior.render.pictures import png_bytes
-
-        picture = base64.b64encode(png_bytes(self.picture())).decode()
-        return (
-            f'<figure><img src="data:image/png;base64,{picture}" alt="a room">'
-            f"<figcaption>{html.escape(self.name)}: {self._contents}</figcaption></figure>"
-        )

@@ -40,10 +40,9 @@ def scene_to_json(scene: Scene) -> dict[str, Any]:
         entry["center_m"] = _rounded(item.center_m)
         entry["size_m"] = _rounded_size(item.size_m)
         if item.turned is not None:
-            entry["yaw_rad"] = round(item.turned.yaw_rad, 7)
-            entry["own_size_m"] = _rounded_size(item.turned.size_m)
-            if item.turned.confidence < 1:
-                entry["yaw_confidence"] = round(item.turned.confidence, 3)
+            facing = item.facing
+            entry["yaw_rad"] = facing.pop("yaw_rad")
+            entry |= {"own_size_m": _rounded_size(item.turned.size_m), **facing}
         solids = [solid for solid in item.solids if isinstance(solid, Solid)]
         if solids and len(solids) == len(item.solids):  # the file holds no meshes
             entry["solids"] = [

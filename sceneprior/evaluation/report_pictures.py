@@ -11,11 +11,11 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from sceneprior.core.classes import label_set
-from sceneprior.core.palette import quiet_colors
 from sceneprior.core.scene import Scene
 from sceneprior.core.shards import Shard, iterate_rooms
 from sceneprior.core.shell import ShellName
 from sceneprior.evaluation.page import data_uri, glb_of, png_uri
+from sceneprior.render.appearance import quiet_colors
 from sceneprior.render.floor_plans import plan_of
 from sceneprior.render.pictures import paint_ids
 from sceneprior.render.topdown import perspective, topdown_protocol, view_of

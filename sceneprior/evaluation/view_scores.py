@@ -19,7 +19,7 @@ from sceneprior.evaluation.metrics.mesh_metrics import (
     oriented_box_iou_3d,
     sample_surface,
 )
-from sceneprior.render.topdown import object_mesh
+from sceneprior.render.appearance import object_mesh
 
 RESAMPLES = 1000
 """Number of bootstrap resamples of rooms per interval."""

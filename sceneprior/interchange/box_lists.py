@@ -15,7 +15,7 @@ from sceneprior.core.files import read_json
 from sceneprior.core.geometry.turns import yaw_rotation
 from sceneprior.core.scene import Mesh, Scene, SceneObject, Turned, bound_m
 from sceneprior.core.scene_json import MOST_OBJECTS, check_box, check_floor
-from sceneprior.render.topdown import box_mesh
+from sceneprior.render.appearance import box_mesh
 
 NEEDED = ("class_labels", "translations", "sizes", "angles")
 FLOOR = ("floor_plan_vertices", "floor_plan_faces", "floor_plan_centroid")

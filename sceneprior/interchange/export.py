@@ -14,7 +14,7 @@ from sceneprior.interchange.atiss import write_atiss
 from sceneprior.interchange.front import write_front
 from sceneprior.interchange.habitat import write_habitat
 from sceneprior.interchange.sceneeval import write_sceneeval
-from sceneprior.render.scene_files import check_names, save_scene
+from sceneprior.render.scene_files import check_names, save
 from sceneprior.render.scene_mjcf import scene_to_mjcf
 from sceneprior.render.scene_usd import scene_to_usd
 
@@ -65,7 +65,7 @@ def export_scenes(
     check_names(scenes)
     if to == "obj":
         for scene in scenes:
-            save_scene(scene, Path(folder) / f"{scene.name}.obj", shell=shell or "none")
+            save(scene, Path(folder) / f"{scene.name}.obj", shell=shell or "none")
         return []
     if to in SIMULATORS:
         standing, notes = stand_all(scenes)

@@ -20,7 +20,7 @@ from sceneprior.core.furniture import MODEL_FILE, category_table, class_of_categ
 from sceneprior.core.outline import floor_polygon, floor_rectangle
 from sceneprior.core.scene import Scene
 from sceneprior.interchange.atiss import floor_plan
-from sceneprior.render.topdown import scene_meshes
+from sceneprior.render.appearance import scene_meshes
 
 ROOM_TYPES = {
     "front3d_bedroom": "Bedroom", "front3d_living": "LivingRoom", "front3d_dining": "DiningRoom",

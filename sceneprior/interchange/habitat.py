@@ -13,8 +13,8 @@ from sceneprior.core.geometry.turns import yaw_rotation
 from sceneprior.core.masses import mass_kg
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.core.shell import ShellName, shell_meshes
+from sceneprior.render.appearance import node_names, scene_meshes
 from sceneprior.render.scene_files import scene_to_glb
-from sceneprior.render.topdown import node_names, scene_meshes
 
 DATASET_FILE = "rooms.scene_dataset_config.json"
 UP, FRONT = [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]

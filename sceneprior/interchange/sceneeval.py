@@ -11,8 +11,8 @@ import numpy as np
 from sceneprior.core.files import write_json, write_whole
 from sceneprior.core.scene import Scene
 from sceneprior.core.shell import THICK_M, Shell, shell_of
+from sceneprior.render.appearance import node_names, scene_meshes
 from sceneprior.render.scene_files import scene_to_glb
-from sceneprior.render.topdown import node_names, scene_meshes
 
 PREFIX = "sceneprior"
 """Prefix of model ids, by which SceneEval identifies a model's data set."""

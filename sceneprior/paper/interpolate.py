@@ -14,13 +14,13 @@ from torch import Tensor
 from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import write_whole
-from sceneprior.core.palette import quiet_colors
 from sceneprior.core.scene import Scene
 from sceneprior.core.threads import single_threaded
 from sceneprior.core.views import DecodedScenes
 from sceneprior.paper.decode import DecodedRoom, decode_rooms, kept_predictions
 from sceneprior.paper.prior import TrainedPrior
 from sceneprior.paper.sampling import Point, latent_of
+from sceneprior.render.appearance import quiet_colors
 from sceneprior.render.pictures import contact_sheet, gif_bytes, png_bytes
 from sceneprior.render.topdown import corner_view, perspective
 

@@ -9,9 +9,9 @@ from PIL import Image, ImageDraw, ImageFont
 
 from sceneprior.core.cameras import Orthographic
 from sceneprior.core.scene import Scene
+from sceneprior.render.appearance import BACKGROUND, FLOOR_COLOR, object_colors, scene_meshes
 from sceneprior.render.offscreen import SoftwareRenderer
 from sceneprior.render.pictures import paint_ids
-from sceneprior.render.topdown import BACKGROUND, FLOOR_COLOR, object_colors, scene_meshes
 
 PLAN_PX, LEGEND_PX, FONT_PX = 512, 150, 13
 LEAST_M = 3.0

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from sceneprior.core.scene import Mesh, Textured, mesh_of_file
-from sceneprior.render.topdown import linear_rgba
+from sceneprior.render.appearance import linear_rgba
 
 LARGEST_PX = 1024
 """Longest side of a texture; larger ones are scaled down, so that the files of rooms stay small."""

@@ -18,24 +18,24 @@ from sceneprior.core.files import is_name, read_json, write_json, write_whole
 from sceneprior.core.scene import Mesh, Scene, Textured
 from sceneprior.core.scene_json import FORMAT, read_scene, scene_to_json
 from sceneprior.core.shell import ShellName, is_shell, shell_meshes
-from sceneprior.render.floor_plans import floor_plan
-from sceneprior.render.model_files import joined, load_parts
-from sceneprior.render.pictures import png_bytes
-from sceneprior.render.scene_usd import scene_to_usd
-from sceneprior.render.topdown import (
+from sceneprior.render.appearance import (
     linear_rgba,
     node_names,
     object_colors,
     scene_meshes,
     shell_color,
 )
+from sceneprior.render.floor_plans import floor_plan
+from sceneprior.render.model_files import joined, load_parts
+from sceneprior.render.pictures import png_bytes
+from sceneprior.render.scene_usd import scene_to_usd
 
 NO_SHELL: Mapping[str, Mesh] = {}
 PACKAGE_FORMATS = "sceneprior-"
 """Prefix of the names of the package's formats."""
 
 
-def save_scene(scene: Scene, path: Path, shell: ShellName = "none") -> None:
+def save(scene: Scene, path: Path | str, shell: ShellName = "none") -> None:
     """Write a scene to one file, atomically, in the format of its suffix.
 
     `.json`: classes and boxes. `.glb`: one node per object, called `<index>_<class>`, in the class
@@ -50,6 +50,16 @@ def save_scene(scene: Scene, path: Path, shell: ShellName = "none") -> None:
 
     Raises:
         InputError: the path has another suffix.
+
+    Example:
+
+        >>> from tempfile import TemporaryDirectory
+        >>> from sceneprior.core.scene import SceneObject
+        >>> bed = SceneObject("double_bed", (0.0, 0.3, 0.0), (1.8, 0.6, 2.0))
+        >>> with TemporaryDirectory() as folder:
+        ...     save(Scene("mine", "front3d_bedroom", (bed,)), f"{folder}/mine.glb")
+        ...     Path(f"{folder}/mine.glb").read_bytes()[:4]
+        b'glTF'
     """
     path = Path(path)
     match path.suffix:
@@ -91,17 +101,12 @@ def scene_to_glb(scene: Scene, shell: Mapping[str, Mesh] = NO_SHELL) -> bytes:
     return bytes(room.export(file_type="glb", include_normals=False))
 
 
-FACING = ("class", "yaw_rad", "yaw_confidence")
-"""Keys of an object's entry in the scene JSON that a GLB repeats."""
-
-
 def glb_extras(scene: Scene) -> dict[str, Any]:
     """Metadata of a scene in its GLB: name, label set, `extra`, and each object's node and class,
     with its yaw where known (docs/conventions.md)."""
-    entries = scene_to_json(scene)["objects"]
     objects = [
-        {"node": node} | {key: entry[key] for key in FACING if key in entry}
-        for node, entry in zip(node_names(scene), entries, strict=True)
+        {"node": node, "class": item.label, **item.facing}
+        for node, item in zip(node_names(scene), scene.objects, strict=True)
     ]
     told = {"name": scene.name, "label_set": scene.label_set, "extra": scene.extra}
     return {"sceneprior": {**told, "objects": objects}}

@@ -10,7 +10,7 @@ from sceneprior.core.colliders import colliders, is_fixed, points_of, volume_and
 from sceneprior.core.masses import mass_kg
 from sceneprior.core.scene import Mesh, Scene, SceneObject, Solid
 from sceneprior.core.shell import Panel, Shell, panels
-from sceneprior.render.topdown import FLOOR_COLOR, WALL_COLOR, node_names, object_colors
+from sceneprior.render.appearance import FLOOR_COLOR, WALL_COLOR, node_names, object_colors
 
 TIMESTEP_S = 0.001
 TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])

@@ -9,7 +9,7 @@ from sceneprior.core.colliders import colliders, is_fixed, mesh_of
 from sceneprior.core.errors import InputError
 from sceneprior.core.masses import mass_kg
 from sceneprior.core.scene import Mesh, Scene, Solid
-from sceneprior.render.topdown import (
+from sceneprior.render.appearance import (
     linear_rgba,
     node_names,
     object_colors,

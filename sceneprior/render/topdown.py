@@ -1,5 +1,8 @@
 """Pictures of scenes: from straight above (for metrics), and from above a corner."""
 
+import base64
+import html
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
@@ -8,19 +11,20 @@ from jaxtyping import UInt8
 
 from sceneprior.core.cameras import Orthographic, Pinhole, look_at
 from sceneprior.core.classes import class_colors, label_set
-from sceneprior.core.geometry.corners import BOX_FACES, box_corners
+from sceneprior.core.errors import InputError
 from sceneprior.core.outline import floor_rectangle, rectangle
-from sceneprior.core.palette import quiet_colors
-from sceneprior.core.scene import Mesh, Scene, SceneObject
+from sceneprior.core.scene import Mesh, Scene
 from sceneprior.core.shell import ShellName, shell_of, slab
+from sceneprior.render.appearance import (
+    BACKGROUND,
+    FLOOR_COLOR,
+    WALL_COLOR,
+    object_colors,
+    scene_meshes,
+)
 from sceneprior.render.offscreen import SoftwareRenderer
-from sceneprior.render.pictures import paint_ids
+from sceneprior.render.pictures import paint_ids, png_bytes
 
-BACKGROUND = (255, 255, 255)
-"""White, which differs clearly from all class colours and prints as paper."""
-
-FLOOR_COLOR = (232, 228, 220)
-WALL_COLOR = (252, 251, 249)
 DIRECTION = np.array([0.42, 0.62, 0.66])
 """Unit vector from a room towards the camera of `perspective`; 3D models start in this view."""
 
@@ -56,43 +60,6 @@ def topdown_protocol(label_set_name: str) -> TopDownProtocol:
     """
     label_set(label_set_name)
     return TopDownProtocol(window_m=6.4 if label_set_name == "front3d_bedroom" else 12.8)
-
-
-def box_mesh(center_m: Sequence[float], size_m: Sequence[float]) -> Mesh:
-    """A box as a mesh of 12 triangles that face outwards."""
-    return Mesh(box_corners(np.asarray(center_m), np.asarray(size_m)), BOX_FACES)
-
-
-def object_mesh(item: SceneObject) -> Mesh:
-    """The object's mesh, or its box if it has none."""
-    return item.mesh if item.mesh is not None else box_mesh(item.center_m, item.size_m)
-
-
-def scene_meshes(scene: Scene) -> list[Mesh]:
-    """One mesh per object, see `object_mesh`."""
-    return [object_mesh(item) for item in scene.objects]
-
-
-def object_colors(scene: Scene) -> UInt8[np.ndarray, "objects 3"]:
-    """Muted RGB colour of each object's class, for pictures and files that people look at."""
-    return quiet_colors([item.label for item in scene.objects])
-
-
-def shell_color(node: str) -> UInt8[np.ndarray, "3"]:
-    """The RGB colour of a node of a room's shell."""
-    return np.array(FLOOR_COLOR if node == "floor" else WALL_COLOR, dtype=np.uint8)
-
-
-def node_names(scene: Scene) -> list[str]:
-    """Names of the objects in files: `<index>_<class>`."""
-    return [f"{index}_{item.label}" for index, item in enumerate(scene.objects)]
-
-
-def linear_rgba(color: UInt8[np.ndarray, "3"]) -> list[float]:
-    """An sRGB colour as linear numbers in [0, 1], as glTF and USD have them, with opacity 1."""
-    srgb = color / 255.0
-    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    return [*(float(value) for value in linear), 1.0]
 
 
 def topdown(
@@ -220,3 +187,27 @@ def perspective(
     return SoftwareRenderer().shaded(
         meshes, colors, view.camera, view.image_size, BACKGROUND, shadowed
     )
+
+
+def html_of(scene: Scene) -> str:
+    """HTML for notebooks: a picture of the scene and its number of objects per class.
+
+    >>> "no objects" in html_of(Scene("empty", "front3d_bedroom"))
+    True
+    """
+    picture = base64.b64encode(png_bytes(perspective(scene))).decode()
+    return (
+        f'<figure><img src="data:image/png;base64,{picture}" alt="a room">'
+        f"<figcaption>{html.escape(scene.name)}: {scene.contents}</figcaption></figure>"
+    )
+
+
+def show(scene: Scene) -> None:
+    """Display a scene in a notebook, from any line of a cell; elsewhere an `InputError`."""
+    notebook = sys.modules.get("IPython")
+    if notebook is None or notebook.get_ipython() is None:
+        raise InputError(
+            "show() draws in a notebook, and this is none; save(scene, 'room.png') writes a "
+            "picture, and 'room.glb' a model."
+        )
+    notebook.display.display(notebook.display.HTML(html_of(scene)))

@@ -13,6 +13,7 @@ import sceneprior
 from sceneprior.apps.requests import RequestFile, load_request, merged
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Opening, Scene, SceneObject
+from sceneprior.render.scene_files import save
 
 BED = {"class": "double_bed", "center_m": [0.0, 0.3, -0.4], "size_m": [1.8, 0.6, 2.0]}
 REQUEST = {
@@ -81,7 +82,7 @@ def test_a_part_is_in_the_file_or_in_the_options():
 def test_a_floor_of_a_file_brings_its_door(prior, tmp_path):
     outline = np.array([[-2, -1.5], [2, -1.5], [2, 1.5], [-2, 1.5]])
     door = Opening("door", (-0.5, -1.5), (0.4, -1.5), 0.0, 2.0)
-    Scene("plan", "front3d_bedroom", (), outline, openings=(door,)).save(tmp_path / "plan.json")
+    save(Scene("plan", "front3d_bedroom", (), outline, openings=(door,)), tmp_path / "plan.json")
     (room,) = prior.sample(1, floor=f"{tmp_path}/plan.json")
     assert room.openings == (door,) and (room.floor_m == outline).all()
     (room,) = prior.sample(1, floor=f"{tmp_path}/plan.json", openings="window@north")
@@ -142,7 +143,7 @@ def test_objects_in_centimetres_are_a_sentence(prior):
 
 def test_complete_takes_requests(command, tmp_path):
     bed = SceneObject("double_bed", (0.0, 0.3, -0.4), (1.8, 0.6, 2.0))
-    Scene("mine", "front3d_bedroom", (bed,)).save(tmp_path / "given.json")
+    save(Scene("mine", "front3d_bedroom", (bed,)), tmp_path / "given.json")
     lamp = {"class": "nightstand", "center_m": [1.3, 0.25, -1.2], "size_m": [0.4, 0.5, 0.4]}
     path = written(tmp_path, floor=None, openings=[], want=None, objects=[lamp])
     status, told, errors = command(

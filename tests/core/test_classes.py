@@ -5,7 +5,7 @@ import pytest
 
 from sceneprior.core.classes import LABEL_SETS, class_colors, label_set, label_set_name
 from sceneprior.core.errors import InputError
-from sceneprior.core.palette import quiet_colors
+from sceneprior.render.appearance import quiet_colors
 from sceneprior.render.topdown import topdown_protocol
 
 

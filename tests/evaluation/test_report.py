@@ -12,14 +12,13 @@ from PIL import Image
 from toy_metrics import without_classifiers
 
 from sceneprior.core.ground_truth import reference_scenes
-from sceneprior.core.palette import quiet_colors
 from sceneprior.core.scene import Opening, Scene, SceneObject
 from sceneprior.evaluation.report import write_report
 from sceneprior.evaluation.report_pictures import input_views, legend, room_pictures
 from sceneprior.evaluation.rooms_page import write_rooms_page
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
+from sceneprior.render.appearance import FLOOR_COLOR, quiet_colors
 from sceneprior.render.floor_plans import DOOR
-from sceneprior.render.topdown import FLOOR_COLOR
 
 
 @pytest.fixture(scope="module")

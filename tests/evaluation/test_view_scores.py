@@ -8,7 +8,7 @@ import pytest
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import SceneObject
 from sceneprior.evaluation.view_scores import ObjectPair, score_pair, score_views, surface_note
-from sceneprior.render.topdown import box_mesh
+from sceneprior.render.appearance import box_mesh
 
 POINTS = 4000
 

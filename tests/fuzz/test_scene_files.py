@@ -25,7 +25,7 @@ def begun(folder: Path) -> np.random.Generator:
 
 def example() -> Any:
     from sceneprior.core.scene import Scene, SceneObject, Turned
-    from sceneprior.render.topdown import box_mesh
+    from sceneprior.render.appearance import box_mesh
 
     bed = SceneObject("double_bed", (0.0, 0.3, -0.5), (1.8, 0.6, 2.0))
     turned = Turned(np.pi / 2, (1.2, 0.8, 0.6))
@@ -41,14 +41,14 @@ def example() -> Any:
 def use_scenes(scenes: list, folder: Path) -> None:
     """Draw and write what could be read, in each format."""
     from sceneprior.interchange.export import export_scenes
-    from sceneprior.render.scene_files import load_scene, save_scene
+    from sceneprior.render.scene_files import load_scene, save
     from sceneprior.render.topdown import TopDownProtocol, perspective, topdown
 
     for scene in scenes:
         topdown(scene, TopDownProtocol((32, 32)))
         perspective(scene, (24, 32))
         for ending in (".json", ".glb", ".obj"):
-            save_scene(scene, folder / f"again{ending}")
+            save(scene, folder / f"again{ending}")
         load_scene(folder / "again.json")
     for to in ("atiss", "threed-front"):
         export_scenes(scenes, to, folder / to)
@@ -67,10 +67,10 @@ def fuzz_json(folder: Path) -> None:
 
 
 def fuzz_glb(folder: Path) -> None:
-    from sceneprior.render.scene_files import load_scene_folder, save_scene, scene_to_glb
+    from sceneprior.render.scene_files import load_scene_folder, save, scene_to_glb
 
     rng = begun(folder)
-    save_scene(example(), folder / "given" / "room.json")
+    save(example(), folder / "given" / "room.json")
     glb = scene_to_glb(example())
     length = struct.unpack("<I", glb[12:16])[0]
     text, binary = glb[20 : 20 + length], glb[20 + length :]

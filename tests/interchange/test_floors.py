@@ -15,6 +15,7 @@ from sceneprior.core.scene import Opening, Scene, SceneObject
 from sceneprior.interchange.export import export_scenes
 from sceneprior.interchange.floors import FloorPlan, read_floor_file
 from sceneprior.lifted.requests.openings import place_openings
+from sceneprior.render.scene_files import save
 
 L_SHAPE = np.array([[-2, -2], [2, -2], [2, 1], [0, 1], [0, 2], [-2, 2]], dtype=float)
 DOOR = Opening("door", (-0.5, -2.0), (0.4, -2.0), 0.0, 2.0)
@@ -26,7 +27,7 @@ ROOM = Scene(
 
 def written(folder: Path, to: str) -> str:
     if to == "scene":
-        ROOM.save(folder / "room.json")
+        save(ROOM, folder / "room.json")
         return f"{folder}/room.json"
     if to == "polygon":
         (folder / "floor.json").write_text(json.dumps(L_SHAPE.tolist()))
@@ -67,7 +68,7 @@ def test_what_has_no_floor_is_a_sentence(text, message, tmp_path):
 
 
 def test_a_scene_without_a_floor_is_a_sentence(tmp_path):
-    Scene("bare", "front3d_bedroom").save(tmp_path / "bare.json")
+    save(Scene("bare", "front3d_bedroom"), tmp_path / "bare.json")
     with pytest.raises(InputError, match="a scene without a floor; give one with floor_m"):
         read_floor_file(f"{tmp_path}/bare.json")
 

@@ -14,7 +14,7 @@ from sceneprior.core.colliders import colliders, mesh_of
 from sceneprior.core.masses import mass_kg
 from sceneprior.core.scene import Opening, Scene, SceneObject, Solid, Turned, bound_m
 from sceneprior.interchange.export import export_scenes
-from sceneprior.render.scene_files import save_scene
+from sceneprior.render.scene_files import save
 
 BEDROOM = "front3d_bedroom"
 L = np.array([[-2.5, -2], [2.5, -2], [2.5, 0.5], [0.5, 0.5], [0.5, 2.2], [-2.5, 2.2]])
@@ -86,7 +86,7 @@ def test_mujoco_loads_a_room_with_walls_in_which_nothing_overlaps(scene, tmp_pat
 
 def test_usd_holds_meshes_in_metres_with_y_up(scene, tmp_path):
     geometry = pytest.importorskip("pxr.UsdGeom")
-    save_scene(scene, tmp_path / "room.usda", shell="floor")
+    save(scene, tmp_path / "room.usda", shell="floor")
     stage = pytest.importorskip("pxr.Usd").Stage.Open(str(tmp_path / "room.usda"))
     assert geometry.GetStageUpAxis(stage) == "Y" and geometry.GetStageMetersPerUnit(stage) == 1.0
     *objects, floor = stage.GetDefaultPrim().GetChildren()

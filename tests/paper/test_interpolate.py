@@ -11,7 +11,6 @@ from torch import nn
 
 import sceneprior
 from sceneprior.core.errors import InputError
-from sceneprior.core.palette import quiet_colors
 from sceneprior.core.views import DecodedScenes
 from sceneprior.paper.decode import decode_latents, decode_rooms
 from sceneprior.paper.interpolate import (
@@ -27,6 +26,7 @@ from sceneprior.paper.interpolate import (
 from sceneprior.paper.latents import LatentCube
 from sceneprior.paper.prior import ScenePrior
 from sceneprior.paper.shape_decoder import ShapeDecoder, ShapeDecoderConfig
+from sceneprior.render.appearance import quiet_colors
 from sceneprior.render.topdown import corner_view, perspective
 
 

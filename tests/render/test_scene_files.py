@@ -14,7 +14,6 @@ from PIL import Image
 from sceneprior.apps.rooms import write_scene, write_scenes
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.palette import quiet_colors
 from sceneprior.core.scene import (
     Mesh,
     Scene,
@@ -25,12 +24,13 @@ from sceneprior.core.scene import (
     quarter_turned,
 )
 from sceneprior.core.scene_json import scene_to_json
+from sceneprior.render.appearance import quiet_colors
 from sceneprior.render.floor_plans import floor_plan
 from sceneprior.render.scene_files import (
     load_scene,
     load_scene_folder,
     read_glb_parts,
-    save_scene,
+    save,
     scene_to_glb,
 )
 from sceneprior.render.topdown import topdown
@@ -206,14 +206,14 @@ def test_what_room_files_cannot_hold_is_refused(tmp_path):
 
 def test_flat_sides_stay_above_zero(tmp_path):
     flat = SceneObject("table", (0.0, 0.0, 0.0), (1.0, 0.0, 1.0))
-    save_scene(Scene("a", "front3d_bedroom", (flat,)), tmp_path / "a.json")
+    save(Scene("a", "front3d_bedroom", (flat,)), tmp_path / "a.json")
     assert load_scene(tmp_path / "a.json").objects[0].size_m == (1.0, 1e-5, 1.0)
 
 
 def test_turned_boxes_come_back(tmp_path):
     turned = Turned(0.5, (1.8, 0.6, 2.0))
     bed = SceneObject("double_bed", (0.0, 0.3, 0.0), bound_m(turned), turned=turned)
-    save_scene(Scene("a", "front3d_bedroom", (bed,)), tmp_path / "a.json")
+    save(Scene("a", "front3d_bedroom", (bed,)), tmp_path / "a.json")
     (back,) = load_scene(tmp_path / "a.json").objects
     assert back.turned == turned
     # In another box it is no longer known.
@@ -244,7 +244,7 @@ def test_arrays_that_are_no_mesh_are_refused(vertices, faces, sentence):
     ],
 )
 def test_a_damaged_mesh_of_a_glb_is_refused(scene, tmp_path, part, value, sentence):
-    save_scene(scene, tmp_path / "a.json")
+    save(scene, tmp_path / "a.json")
     glb = bytearray(scene_to_glb(scene))
     content = glb_json(glb)
     primitive = content["meshes"][0]["primitives"][0]
@@ -291,7 +291,7 @@ def test_floors_without_area_are_refused_when_read(tmp_path):
 
 
 def test_an_obj_has_a_named_object_each_in_metres_and_its_class_colour(scene, tmp_path):
-    save_scene(replace(scene, objects=(*scene.objects, scene.objects[1])), tmp_path / "a.obj")
+    save(replace(scene, objects=(*scene.objects, scene.objects[1])), tmp_path / "a.obj")
     vertices, faces, materials = [], {}, {}
     for kind, *words in map(str.split, filter(None, (tmp_path / "a.obj").read_text().splitlines())):
         if kind == "o":
@@ -316,7 +316,7 @@ def test_an_obj_has_a_named_object_each_in_metres_and_its_class_colour(scene, tm
     colors = {b.split()[0]: re.search(r"Kd (.*)", b)[1] for b in blocks}
     assert colors[materials["1_nightstand"]] == colors[materials["2_nightstand"]]
     assert colors[materials["1_nightstand"]] != colors[materials["0_double_bed"]]
-    save_scene(replace(scene, objects=()), tmp_path / "none.obj")
+    save(replace(scene, objects=()), tmp_path / "none.obj")
     assert (tmp_path / "none.obj").read_text() == ""
 
 
@@ -324,7 +324,7 @@ def test_a_room_with_walls_is_read_as_its_furniture(tmp_path):
     bed = SceneObject("double_bed", (0.0, 0.3, 0.0), (1.8, 0.6, 2.0))
     scene = Scene("a", "front3d_bedroom", (bed,))
     for ending in (".glb", ".obj", ".json"):
-        save_scene(scene, tmp_path / f"a{ending}", shell="walls")
+        save(scene, tmp_path / f"a{ending}", shell="walls")
     loaded = trimesh.load_scene(tmp_path / "a.glb")
     shell = ["floor", "wall_0", "wall_1", "wall_2", "wall_3", "ceiling"]
     assert set(loaded.graph.nodes_geometry) == {"0_double_bed", *shell}
@@ -338,5 +338,5 @@ def test_a_room_with_walls_is_read_as_its_furniture(tmp_path):
 @pytest.mark.parametrize("shell", ["none", "floor", "walls"])
 def test_the_gltf_validator_finds_nothing(tmp_path, shell):
     bed = SceneObject("double_bed", (0.0, 0.3, 0.0), (1.8, 0.6, 2.0))
-    save_scene(Scene("a", "front3d_bedroom", (bed,)), tmp_path / "a.glb", shell=shell)
+    save(Scene("a", "front3d_bedroom", (bed,)), tmp_path / "a.glb", shell=shell)
     validate(tmp_path / "a.glb")

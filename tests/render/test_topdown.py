@@ -5,15 +5,9 @@ import pytest
 
 from sceneprior.core.classes import class_colors
 from sceneprior.core.errors import InputError
-from sceneprior.core.palette import quiet_colors
 from sceneprior.core.scene import Scene, SceneObject
-from sceneprior.render.topdown import (
-    TopDownProtocol,
-    box_mesh,
-    perspective,
-    topdown,
-    topdown_protocol,
-)
+from sceneprior.render.appearance import box_mesh, quiet_colors
+from sceneprior.render.topdown import TopDownProtocol, perspective, topdown, topdown_protocol
 
 BED, LAMP = 9, 14  # rows of double_bed and pendant_lamp in the bedroom label set
 

@@ -45,7 +45,7 @@ def model_card(
         f"A generative prior of rooms, trained by `sceneprior` {__version__} on "
         f"{len(trained.room_ids)} rooms. Rooms are sampled from: {packed.distribution}.",
         f'```python\nimport sceneprior\n\nprior = sceneprior.load("{name}.prior")\n'
-        'prior.sample(4, seed=0)[0].save("room.glb")\n```',
+        'sceneprior.save(prior.sample(4, seed=0)[0], "room.glb")\n```',
         _classes(trained),
         "Boxes and meshes are in metres, with y up and the floor at y = 0.",
         "## Data, authors and licence",

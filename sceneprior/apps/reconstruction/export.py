@@ -14,18 +14,13 @@ from sceneprior.core.cameras import Pinhole
 from sceneprior.core.classes import label_set
 from sceneprior.core.files import write_whole
 from sceneprior.core.observed_image import ObservedImage
-from sceneprior.core.palette import quiet_colors
 from sceneprior.core.scene import Scene
 from sceneprior.evaluation.page import png_uri
 from sceneprior.evaluation.rooms_page import write_rooms_page
+from sceneprior.render.appearance import object_colors, quiet_colors, scene_meshes
 from sceneprior.render.offscreen import SoftwareRenderer
 from sceneprior.render.pictures import paint_ids, png_bytes
-from sceneprior.render.topdown import (
-    object_colors,
-    scene_meshes,
-    topdown,
-    topdown_protocol,
-)
+from sceneprior.render.topdown import topdown, topdown_protocol
 
 HEIGHT_PX = 360
 """Height of each panel, to which masks are scaled."""

@@ -24,7 +24,7 @@ from sceneprior.apps.retrieval.cad_models import CadModels, ClassModels
 from sceneprior.core.geometry.surfaces import chamfer_mean, surface_points
 from sceneprior.core.geometry.turns import QUARTERS, quarter_rotation
 from sceneprior.core.scene import Mesh, Scene, SceneObject, quarter_turned
-from sceneprior.render.topdown import box_mesh
+from sceneprior.render.appearance import box_mesh
 
 STANDS_M = 1.0
 """Largest height of a box's centre for which the box is extruded to the floor."""

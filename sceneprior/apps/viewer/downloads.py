@@ -1,4 +1,4 @@
-"""The shown room as one file to download, in each format that `export` and `save_scene` write."""
+"""The shown room as one file to download, in each format that `export` and `save` write."""
 
 import io
 import zipfile
@@ -8,10 +8,10 @@ from tempfile import TemporaryDirectory
 from sceneprior.core.scene import Scene
 from sceneprior.core.shell import ShellName
 from sceneprior.interchange.export import SIMULATORS, export_scenes
-from sceneprior.render.scene_files import check_names, save_scene
+from sceneprior.render.scene_files import check_names, save
 
 SAVED = {"GLB": ".glb", "JSON": ".json"}
-"""Formats of `save_scene`, by the names that the page shows."""
+"""Formats of `save`, by the names that the page shows."""
 EXPORTED = {
     "OBJ": "obj", "USD": "usd", "MuJoCo (MJCF)": "mujoco", "Habitat": "habitat",
     "SceneEval": "sceneeval", "ATISS": "atiss", "3D-FRONT": "threed-front",
@@ -36,7 +36,7 @@ def download(scene: Scene, form: str, shell: ShellName) -> tuple[str, bytes, lis
     with TemporaryDirectory() as name:
         folder = Path(name)
         if form in SAVED:
-            save_scene(scene, folder / f"{scene.name}{SAVED[form]}", shell=shell)
+            save(scene, folder / f"{scene.name}{SAVED[form]}", shell=shell)
         else:
             to = EXPORTED[form]
             chosen = shell if to in (*SIMULATORS, "obj") else None

@@ -5,7 +5,7 @@ from jaxtyping import Float
 
 from sceneprior.core.scene import Scene
 from sceneprior.core.shell import Shell
-from sceneprior.render.topdown import scene_meshes
+from sceneprior.render.appearance import scene_meshes
 
 FOV_RAD = 0.75
 """Vertical field of view of the camera."""

@@ -9,7 +9,7 @@ import numpy as np
 from sceneprior.core.geometry.corners import BOX_EDGES, box_corners
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.core.shell import ShellName, shell_meshes, shell_of
-from sceneprior.render.topdown import object_colors, object_mesh, shell_color
+from sceneprior.render.appearance import object_colors, object_mesh, shell_color
 
 if TYPE_CHECKING:
     import viser

@@ -8,7 +8,7 @@ from markupsafe import Markup
 from sceneprior.apps.viewer.explorer import Shown
 from sceneprior.apps.viewer.nodes import name_and_size
 from sceneprior.core.scene import Scene
-from sceneprior.render.topdown import object_colors
+from sceneprior.render.appearance import object_colors
 
 _TEXT = Markup('<div style="padding: 0 0.8em 0.8em; font-size: 0.875em">{}</div>')
 _LIST = Markup(

@@ -18,7 +18,7 @@ from sceneprior.core.geometry.surfaces import surface_points
 from sceneprior.core.ground_truth import reference_scene
 from sceneprior.core.shards import iterate_rooms
 from sceneprior.core.views import SceneViews
-from sceneprior.render.topdown import object_mesh
+from sceneprior.render.appearance import object_mesh
 
 POINTS = 256
 """Number of points sampled on the surface of each object."""

@@ -27,8 +27,8 @@ from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.core.shards import Shard, iterate_rooms
 from sceneprior.core.views import DecodedScenes
 from sceneprior.paper.matching import match_objects, matching_cost
+from sceneprior.render.appearance import scene_meshes
 from sceneprior.render.offscreen import Renderer
-from sceneprior.render.topdown import scene_meshes
 
 BOX_WEIGHT, OCCLUSION_SLACK = 5.0, 0.15
 """Weight and occlusion slack of the cost by which a room's objects are matched to masks

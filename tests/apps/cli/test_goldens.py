@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from sceneprior.apps.cli.commands import app
 from sceneprior.core.scene import Scene, SceneObject
-from sceneprior.render.scene_files import save_scene
+from sceneprior.render.scene_files import save
 
 HELP = Path(__file__).parents[2] / "golden" / "help"
 COMMANDS = sorted(typer.main.get_command(app).commands)
@@ -101,7 +101,7 @@ REFUSED = {
 def files(command, tmp_path):
     """A room at `rooms/room.json`, a folder `run` with a config, and a request."""
     bed = SceneObject("double_bed", (0.0, 0.5, 0.0), (2.0, 1.0, 2.0))
-    save_scene(Scene("room", "front3d_bedroom", (bed,)), tmp_path / "rooms" / "room.json")
+    save(Scene("room", "front3d_bedroom", (bed,)), tmp_path / "rooms" / "room.json")
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "config.yaml").write_text("method: lifted\n")
     request = '{"format": "sceneprior-request", "version": 1, "floor": "4x3"}'

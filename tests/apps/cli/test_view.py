@@ -11,7 +11,7 @@ import pytest
 from cli_helpers import one_sentence
 
 from sceneprior.core.scene import Scene, SceneObject
-from sceneprior.render.scene_files import save_scene
+from sceneprior.render.scene_files import save
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def test_what_cannot_be_shown_is_said(command, tmp_path, port):
     call = ["--port", port]
     assert "No prior at nowhere;" in one_sentence(command("view", "nowhere", *call))
     bed = SceneObject("double_bed", (0.0, 0.5, 0.0), (2.0, 1.0, 2.0))
-    save_scene(Scene("room", "front3d_bedroom", (bed,)), tmp_path / "rooms" / "room.json")
+    save(Scene("room", "front3d_bedroom", (bed,)), tmp_path / "rooms" / "room.json")
     said = one_sentence(command("view", "rooms", "--host", "no.such.host.invalid", *call))
     assert "of no.such.host.invalid cannot be used" in said
 
@@ -47,7 +47,7 @@ def test_ctrl_c_ends_it_with_one_sentence(start, tmp_path, port):
     pytest.importorskip("viser", reason="the extra `view` is not installed")
     bed = SceneObject("double_bed", (0.0, 0.5, 0.0), (2.0, 1.0, 2.0))
     for name in ("a", "b"):
-        save_scene(Scene(name, "front3d_bedroom", (bed,)), tmp_path / f"{name}.json")
+        save(Scene(name, "front3d_bedroom", (bed,)), tmp_path / f"{name}.json")
     process = start(
         [sys.executable, "-m", "sceneprior", "view", str(tmp_path), "--port", str(port)],
         stdout=subprocess.PIPE,

@@ -23,7 +23,7 @@ from sceneprior.core.shards import iterate_rooms
 from sceneprior.core.views import DecodedScenes
 from sceneprior.evaluation.metrics.contents import category_kl, class_frequencies
 from sceneprior.paper.sampling import COPIES
-from sceneprior.render.topdown import box_mesh
+from sceneprior.render.appearance import box_mesh
 
 
 def test_the_users_scenes_are_evaluated(command, scenes, toy_shards, tmp_path):

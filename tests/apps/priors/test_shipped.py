@@ -11,6 +11,7 @@ import sceneprior
 from sceneprior.apps.priors.packed import FILES, read_packed
 from sceneprior.apps.priors.where import shipped_priors
 from sceneprior.core.errors import InputError
+from sceneprior.render.scene_files import save
 
 SHIPPED = shipped_priors()
 
@@ -68,7 +69,7 @@ def test_rooms_say_which_prior_made_them(name, tmp_path):
     }
     assert room.extra == wanted
     for ending in ("json", "glb"):
-        room.save(tmp_path / f"room.{ending}")
+        save(room, tmp_path / f"room.{ending}")
     read = sceneprior.load_scene(tmp_path / "room.json")
     assert read.extra == wanted
     assert [item.turned.yaw_rad for item in read.objects] == pytest.approx(

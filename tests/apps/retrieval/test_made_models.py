@@ -14,8 +14,8 @@ from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.core.scene_json import scene_to_json
 from sceneprior.furniture.catalog import furniture_classes, make_variants
 from sceneprior.interchange.export import export_scenes
-from sceneprior.render.scene_files import load_scene, save_scene
-from sceneprior.render.topdown import box_mesh
+from sceneprior.render.appearance import box_mesh
+from sceneprior.render.scene_files import load_scene, save
 
 
 def closed(mesh: Mesh) -> bool:
@@ -106,7 +106,7 @@ def test_files_hold_the_models_and_simulators_get_them(prior, tmp_path):
     (room,) = prior.sample(seed=1, cad=True)
     room = replace(room, objects=room.objects[:3])
     for ending in (".glb", ".json"):
-        save_scene(room, tmp_path / f"room{ending}")
+        save(room, tmp_path / f"room{ending}")
     read = load_scene(tmp_path / "room.json")
     assert all(closed(item.mesh) for item in read.objects)
     assert [item.turned.yaw_rad for item in read.objects] == pytest.approx(

@@ -21,7 +21,7 @@ from sceneprior.core.geometry.turns import quarter_rotation
 from sceneprior.core.scene import Mesh, Scene, SceneObject, quarter_turned
 from sceneprior.interchange.export import export_scenes
 from sceneprior.render.model_files import LARGEST_PX
-from sceneprior.render.scene_files import load_scene, scene_to_obj
+from sceneprior.render.scene_files import load_scene, save, scene_to_obj
 
 SEAT = (2.0, 0.4, 0.8)
 PIXELS = np.random.default_rng(0).integers(0, 256, (8, 8, 3), dtype=np.uint8)
@@ -99,8 +99,8 @@ def test_a_glb_has_the_images_and_colours_of_the_model(models, tmp_path):
 
 def test_texture_coordinates_are_those_of_the_model(models, tmp_path):
     scene = retrieved(models)
-    scene.save(tmp_path / "room.glb")
-    scene.save(tmp_path / "room.json")
+    save(scene, tmp_path / "room.glb")
+    save(scene, tmp_path / "room.json")
     back = load_scene(tmp_path / "room.json", with_materials=True)
     sofa, desk = back.objects
     assert desk.textured == () and len(sofa.textured) == 2
@@ -113,8 +113,8 @@ def test_texture_coordinates_are_those_of_the_model(models, tmp_path):
 def test_meshes_of_textured_objects_are_closed_when_they_are_read(models, tmp_path):
     """Vertices are repeated along the seams of a texture, but colliders need closed meshes."""
     scene = retrieved(models)
-    scene.save(tmp_path / "room.glb")
-    scene.save(tmp_path / "room.json")
+    save(scene, tmp_path / "room.glb")
+    save(scene, tmp_path / "room.json")
     for with_materials in (False, True):
         sofa = load_scene(tmp_path / "room.json", with_materials).objects[0]
         assert bool(sofa.textured) == with_materials
@@ -124,7 +124,7 @@ def test_meshes_of_textured_objects_are_closed_when_they_are_read(models, tmp_pa
 
 
 def test_the_gltf_validator_finds_nothing(models, tmp_path):
-    retrieved(models).save(tmp_path / "room.glb")
+    save(retrieved(models), tmp_path / "room.glb")
     validate(tmp_path / "room.glb")
 
 

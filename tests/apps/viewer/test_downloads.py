@@ -11,6 +11,7 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Opening, Scene, SceneObject
 from sceneprior.interchange.export import FORMATS as EXPORT_FORMATS
 from sceneprior.interchange.export import export_scenes
+from sceneprior.render.scene_files import save
 
 BED = SceneObject("double_bed", (0.0, 0.3, 0.0), (1.8, 0.6, 2.0))
 DOOR = Opening("door", (-0.5, -1.5), (0.4, -1.5), 0.0, 2.0)
@@ -39,7 +40,7 @@ def test_a_download_is_what_export_writes(form, room, tmp_path):
     name, content, _ = download(room, form, "walls")
     assert download(room, form, "walls")[1] == content
     if form not in EXPORTED:
-        room.save(tmp_path / "mine.json")
+        save(room, tmp_path / "mine.json")
         assert name in ("mine.glb", "mine.json")
         if name == "mine.json":
             assert content == (tmp_path / "mine.json").read_bytes()

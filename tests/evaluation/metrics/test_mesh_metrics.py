@@ -17,7 +17,7 @@ from sceneprior.evaluation.metrics.mesh_metrics import (
     oriented_box_iou_3d,
     sample_surface,
 )
-from sceneprior.render.topdown import box_mesh
+from sceneprior.render.appearance import box_mesh
 
 
 def random_boxes(rng: np.random.Generator, count: int) -> list[OrientedBox]:
