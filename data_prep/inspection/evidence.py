@@ -1,26 +1,40 @@
-"""Evidence for and against each camera mistake, from one room's masks and cameras alone."""
+"""Evidence for and against each camera mistake, from one room's masks and cameras alone.
+
+The middle of a 2D box, in u or in v, is taken as the projection of one 3D point of its object, if
+nothing cuts the box off along that axis. With the right cameras, these points exist and lie in
+front of the cameras. Many hypotheses about the cameras are compared at once.
+"""
 
 from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import rankdata
 
-from data_prep.inspection.causes import GIVEN, Cause, Convention, corrected
-from data_prep.inspection.triangulation import Middles, fit, middles
-from data_prep.readers.posed.floor import find_floor
+from data_prep.inspection.agreement import NEAR_M, Room
+from data_prep.inspection.camera_convention import Convention
+from data_prep.inspection.causes import Cause, corrections
+from data_prep.posed.floor import find_floor
+from data_prep.upright import own_sides
 from sceneprior.core.cameras import camera_centers
 from sceneprior.core.shards import RoomViews
 
+TOLERANCE, OF_BOX = 0.01, 0.15
+"""Distance at which the agreement of a middle is one half: a share of the longer side of the image,
+plus a share of the 2D box, whose middle is not exactly the projection of a fixed point."""
+_MIDDLES_AT_MOST = 60
+"""Maximum number of middles per object, thinned evenly; more only take longer."""
+_MIDDLES_AT_LEAST = 5
+"""Minimum number of middles per object; three determine a point."""
+_ROUNDS = 6
 _LEAST_VIEWS = 5
 """Minimum number of views for comparing the order of frames."""
-
 _SAME_FLOOR_M = 0.1
 _PIECES = 3
 """Minimum number of pieces that determine a room's floor: two lamps may hang at the same height."""
 
 
 class Evidence(NamedTuple):
-    """Evidence of one room."""
+    """Evidence of one room, or of several."""
 
     sums: dict[Cause, float]
     """Summed agreement (`fit`) of box middles with cameras, after the correction of each cause."""
@@ -51,27 +65,44 @@ class Evidence(NamedTuple):
         """Mean agreement in [0, 1] after a correction."""
         return self.sums.get(cause, 0.0) / max(self.middles, 1)
 
+    @property
+    def counts(self) -> str:
+        """Text with the mean number of ids per image, and of images per id."""
+        return (
+            f"{self.masks / max(self.views, 1):.1f} ids per image, "
+            f"{self.masks / max(self.ids, 1):.1f} images per id"
+        )
+
 
 def room_evidence(views: RoomViews, convention: Convention, floor: bool = True) -> Evidence:
     """Compare the masks of one room, read with images, with its cameras as they are and corrected.
 
     `floor` also estimates the height of the floor, which takes longer than everything else.
     """
-    found, cameras = middles(views), corrected(views, convention)
-    agreement, depth = fit(found, *map(np.stack, zip(*cameras.values(), strict=True)))
-    sums = dict(zip(cameras, agreement.sum(axis=1).tolist(), strict=True))
-    poses, lenses = cameras[GIVEN]
-    turns = poses[:, :3, :3]
-    eyes = camera_centers(poses)
-    level = find_floor(views, poses, lenses) if floor else None  # type: ignore[arg-type]
+    found, rooms = middles(views), corrections(Room(views), convention)
+    poses = np.stack([room.views.world_to_camera for room in rooms.values()])
+    lenses = np.stack([room.views.intrinsics for room in rooms.values()])
+    agreement, depth = fit(found, poses, lenses)
+    sums = dict(zip(rooms, agreement.sum(axis=1).tolist(), strict=True))
+    level = find_floor(views, poses[0], lenses[0]) if floor else None
     shown = views.visible.sum(axis=0)
-    x, y, z = (-turns[:, 1]).mean(axis=0).tolist()
+    x, y, z = (-poses[0, :, 1, :3]).mean(axis=0).tolist()
     return Evidence(
-        sums, 1, len(found.item), found.spare, len(views.visible), int((shown > 0).sum()),
-        int(shown.sum()), int((shown == 1).sum()), len(np.unique(found.item)),
-        _nearness(views), (x, y, z), float(np.median(eyes[:, 1])), _length(found, depth[0], lenses),
-        None if level is None or level[1] < _PIECES else level[0],
-    )  # fmt: skip
+        sums,
+        rooms=1,
+        middles=len(found.item),
+        spare=found.spare,
+        views=len(views.visible),
+        ids=int((shown > 0).sum()),
+        masks=int(shown.sum()),
+        once=int((shown == 1).sum()),
+        measured=len(np.unique(found.item)),
+        nearness=_nearness(views),
+        tops=(x, y, z),
+        eye_m=float(np.median(camera_centers(poses[0])[:, 1])),
+        length_m=_length(found, depth[0], lenses[0]),
+        floor_m=None if level is None or level[1] < _PIECES else level[0],
+    )
 
 
 def total(rooms: list[Evidence]) -> Evidence:
@@ -121,8 +152,112 @@ def _nearness(views: RoomViews) -> float | None:
     return float(np.corrcoef(ranks)[0, 1])
 
 
+class Middles(NamedTuple):
+    """The m middles of a room's 2D boxes, sorted by object."""
+
+    view: np.ndarray
+    """(m,)"""
+    item: np.ndarray
+    """(m,) number of the object, from 0 without gaps; not its index in the room."""
+    axis: np.ndarray
+    """(m,) 0 for u, 1 for v."""
+    place_px: np.ndarray
+    """(m,)"""
+    extent_px: np.ndarray
+    """(m,) size of the 2D box along this axis."""
+    slack_px: np.ndarray
+    """(m,) distance at which the agreement is one half."""
+
+    @property
+    def spare(self) -> int:
+        """Number of middles beyond the three that determine each object's point."""
+        return len(self.item) - 3 * len(np.unique(self.item))
+
+
+def middles(views: RoomViews) -> Middles:
+    """Find the middles of 2D boxes that nothing cuts off, for objects with enough middles."""
+    own = own_sides(views, views.image_size)
+    whole = np.moveaxis(own[..., :2] & own[..., 2:], 1, 0)  # of each object, view and axis
+    rows = []
+    for k, of_object in enumerate(whole):
+        places = np.argwhere(of_object)
+        if len(places) >= _MIDDLES_AT_LEAST:
+            even = np.linspace(0, len(places) - 1, min(len(places), _MIDDLES_AT_MOST)).round()
+            rows += [(view, k, axis) for view, axis in places[even.astype(int)]]
+    view, item, axis = np.array(rows, dtype=np.int64).reshape(-1, 3).T
+    boxes = views.boxes.astype(np.float64) * np.tile(Room(views).size_px, 2)
+    low, high = boxes[view, item, axis], boxes[view, item, axis + 2]
+    slack = TOLERANCE * max(views.image_size) + OF_BOX * (high - low)
+    number = np.unique(item, return_inverse=True)[1]
+    return Middles(view, number, axis, (low + high) / 2, high - low, slack)
+
+
 def _length(found: Middles, depth: np.ndarray, lenses: np.ndarray) -> float | None:
     sizes_m = found.extent_px * depth / lenses[found.view, found.axis, found.axis]
     lengths = [sizes_m[found.item == k].max() for k in np.unique(found.item)]
     lengths = [length for length in lengths if length > 0]
     return float(np.median(lengths)) if lengths else None
+
+
+def fit(
+    found: Middles, world_to_camera: np.ndarray, intrinsics: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Agreement of each middle with each of h hypotheses about the cameras, and its depth.
+
+    The agreement is 1 / (1 + (r / slack)^2) for the distance r in pixels from the middle to the
+    object's projected point, which is a robust least-squares solution. r is divided by one minus
+    the middle's leverage, and so approximates the distance to the point that the other middles
+    determine. Points behind the camera score 0.
+
+    Args:
+        world_to_camera: (h, T, 4, 4), OpenCV axes; the world frame and its unit are arbitrary.
+        intrinsics: (h, T, 3, 3)
+
+    Returns:
+        The agreement in [0, 1], (h, m), and the depth of each middle's object point, (h, m), in the
+        unit of the poses.
+    """
+    if not len(found.item):
+        none = np.zeros((len(world_to_camera), 0))
+        return none, none
+    rows = np.arange(len(found.item))
+    starts = np.flatnonzero(np.diff(found.item, prepend=-1))
+    scaled, unit = _unit_of_length(world_to_camera)
+    poses = scaled[:, found.view, :3]
+    focal = intrinsics[:, found.view, found.axis, found.axis]
+    center = intrinsics[:, found.view, found.axis, 2]
+    # A middle and the camera's axis span a plane, `planes @ (x, y, z, 1) = 0`, that contains the
+    # point.
+    planes = focal[..., None] * poses[:, rows, found.axis]
+    planes = planes + (center - found.place_px)[..., None] * poses[:, :, 2]
+    weight = 1 / np.abs(focal)
+    for _ in range(_ROUNDS):
+        weighted = planes * weight[..., None]
+        products = weighted[..., :3, None] * weighted[..., None, :]
+        sums = np.add.reduceat(products, starts, axis=1)
+        square = sums[..., :3]
+        loose = 1e-9 * np.trace(square, axis1=-2, axis2=-1) + 1e-12
+        square = square + loose[..., None, None] * np.eye(3)
+        points = np.linalg.solve(square, -sums[..., 3:])[..., 0][:, found.item]
+        depth = (poses[:, :, 2, :3] * points).sum(axis=-1) + poses[:, :, 2, 3]
+        far = np.maximum(np.abs(depth), NEAR_M)
+        off = ((planes[..., :3] * points).sum(axis=-1) + planes[..., 3]) / far
+        weight = 1 / (far * found.slack_px * np.sqrt(1 + (off / found.slack_px) ** 2))
+    inverse, weighted = np.linalg.inv(square)[:, found.item], weighted[..., :3]
+    leverage = np.einsum("hmi,hmij,hmj->hm", weighted, inverse, weighted)
+    off = off / np.maximum(1 - leverage, 1e-3)
+    agreement = np.where(depth > NEAR_M, 1 / (1 + (off / found.slack_px) ** 2), 0.0)
+    return agreement, depth * unit[:, None]
+
+
+def _unit_of_length(world_to_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Poses moved and scaled so that cameras stand about 2 m from the origin, their middle; and the
+    unit of length, (h,)."""
+    eyes = camera_centers(world_to_camera)
+    middle = eyes.mean(axis=1, keepdims=True)
+    unit = np.sqrt(((eyes - middle) ** 2).sum(axis=-1).mean(axis=1)) / 2
+    unit = np.maximum(unit, 1e-9)
+    scaled = world_to_camera.copy()
+    scaled[..., :3, 3] += (world_to_camera[..., :3, :3] @ middle[..., None])[..., 0]
+    scaled[..., :3, 3] /= unit[:, None, None]
+    return scaled, unit

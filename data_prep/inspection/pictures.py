@@ -7,8 +7,8 @@ import numpy as np
 import shapely
 from PIL import Image, ImageDraw, ImageFont
 
-from data_prep.inspection.projection import Segment, wire_pixels
-from sceneprior.core.cameras import camera_centers, to_camera
+from data_prep.inspection.agreement import NEAR_M
+from sceneprior.core.cameras import camera_centers, to_camera, to_pixels
 from sceneprior.core.classes import class_colors, label_set
 from sceneprior.core.found_floor import find_floor
 from sceneprior.core.geometry.corners import BOX_EDGES, box_corners
@@ -27,6 +27,7 @@ _LARGEST_GRID_M = 15.0
 
 
 Color = tuple[int, int, int]
+Segment = tuple[float, float, float, float]
 
 
 def draw_view(
@@ -71,6 +72,32 @@ def draw_view(
         draw.rectangle((x1, y1, max(x2 - 1, x1), max(y2 - 1, y1)), outline=dark, width=2)
         _tag(draw, (x1 + 2, y1 + 2), f"{names[int(room.object_class[k])]} {k + 1}", dark)
     return picture
+
+
+def wire_pixels(
+    points_m: np.ndarray,
+    edges: Iterable[tuple[int, int]],
+    world_to_camera: np.ndarray,
+    intrinsics: np.ndarray,
+) -> list[Segment]:
+    """Project edges, pairs of rows of points, to lines in the image, clipped at the near plane.
+
+    Returns u1, v1, u2, v2 of every edge that lies at least partly beyond the near plane.
+
+    Example: a line that begins 1 m behind the camera is visible from the near plane on.
+
+        >>> line = np.array([[0.0, 0, -1], [0.2, 0, 2]])
+        >>> wire_pixels(line, [(0, 1)], np.eye(4), np.diag([10.0, 10, 1]))
+        [(14.0, 0.0, 1.0, 0.0)]
+    """
+    ends = to_camera(points_m.astype(np.float64), world_to_camera)[np.array(edges)]
+    ends = ends[ends[..., 2].max(axis=1) >= NEAR_M]
+    low, high = ends[..., 2].min(axis=1), ends[..., 2].max(axis=1)
+    # The nearer end moves along the line to the near plane.
+    share = np.where(low < NEAR_M, (NEAR_M - low) / np.where(high > low, high - low, 1), 0.0)
+    nearer = ends[..., 2] < NEAR_M
+    ends += nearer[..., None] * share[:, None, None] * (ends[:, ::-1] - ends)
+    return [tuple(line) for line in to_pixels(ends, intrinsics).round(6).reshape(-1, 4).tolist()]
 
 
 def draw_plan(shard: Shard, room_id: str, width_px: int = 480, height_px: int = 360) -> Image.Image:

@@ -8,13 +8,11 @@ from rich.table import Column, Table
 
 from data_prep.engine.report_tables import make_table
 from data_prep.engine.source import SPLITS
-from data_prep.inspection.agreement import Agreement
-from data_prep.inspection.bodies import KINDS
+from data_prep.inspection.agreement import KINDS
 from data_prep.inspection.causes import CHANCE, GIVEN
+from data_prep.inspection.diagnosis import what_was_checked
 from data_prep.inspection.sheet import choose_views
-from data_prep.inspection.verdicts import what_was_checked
-from data_prep.inspection.verify import FolderCheck, RoomCheck, evidence_of
-from data_prep.inspection.words import counts
+from data_prep.inspection.verify import FolderCheck, RoomCheck, agreement_of, evidence_of
 from sceneprior.core.classes import label_set
 from sceneprior.core.shards import Shard, iterate_rooms, read_index
 
@@ -117,14 +115,13 @@ def _fit(checks: Sequence[RoomCheck]) -> float | None:
 def _judged(checks: Sequence[RoomCheck]) -> list[str]:
     """Table cells: agreement of masks and cameras, type of 3D representation, share of masks within
     their projections, and mean IoU of fully visible objects."""
-    agreement = sum((check.agreement for check in checks), Agreement())
     cells = [
         (
             KINDS[kind],
             f"{tally.share:.1%} of {tally.masks}",
             f"{tally.mean_iou:.3f} of {tally.whole}" if tally.whole else "-",
         )
-        for kind, tally in agreement.tallies.items()
+        for kind, tally in agreement_of(checks).tallies.items()
     ]
     fit = _fit(checks)
     of_truth = ["\n".join(lines) for lines in zip(*cells, strict=True)] or ["-"] * 3
@@ -146,7 +143,7 @@ def summary(found: FolderCheck) -> str:
         if tally.whole:
             text += f"; {tally.whole} unoccluded ones have a mean 2D IoU of {tally.mean_iou:.3f}"
         parts.append(text)
-    parts.append(counts(evidence))
+    parts.append(evidence.counts)
     fit = (
         f"masks and cameras agree by {evidence.share(GIVEN):.2f} of 1 (shuffled cameras: "
         f"{evidence.share(CHANCE):.2f})"

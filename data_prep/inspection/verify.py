@@ -7,23 +7,30 @@ from typing import Any
 
 from data_prep.engine.source import SPLITS
 from data_prep.engine.workers import pool
-from data_prep.inspection.agreement import ROOM_SHARE, Agreement, compare
-from data_prep.inspection.bodies import true_bodies
+from data_prep.inspection.agreement import Agreement, Room, compare, true_bodies
+from data_prep.inspection.camera_convention import Convention, Conventions, read_conventions
 from data_prep.inspection.checks import array_problems, mask_problems, truth_problems
+from data_prep.inspection.diagnosis import (
+    Finding,
+    TrackTrial,
+    disagreement,
+    find_mistake,
+    outliers,
+    try_tracks,
+)
 from data_prep.inspection.evidence import Evidence, room_evidence, total
-from data_prep.inspection.given import Given, given_of
-from data_prep.inspection.tracking import Trial, add, try_tracks
-from data_prep.inspection.truth_causes import try_repairs
-from data_prep.inspection.truth_verdicts import ROOM_MASKS, disagreement, outliers
-from data_prep.inspection.verdicts import Finding, find_mistake
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError, ShardError
 from sceneprior.core.shard_writing import room_checksum
 from sceneprior.core.shards import Shard, list_shards, read_index
 
 _TRIED_ROOMS = 3
-"""Number of rooms in which objects are found without ids, or ground-truth repairs are tried."""
+"""Number of rooms in which objects are found without ids, or corrections of ground truth are
+tried."""
 _NAMED_ROOMS = 5
+_OF_ROOM = {"share": 0.7, "least": 5}
+"""Share of the minima of agreement that each room must reach, so that one wrong room does not go
+unnoticed among many correct ones, and minimum number of masks for a statement about a room."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +69,7 @@ class FolderCheck:
     @property
     def agreement(self) -> Agreement:
         """Agreement summed over all rooms."""
-        return sum((room.agreement for room in self.every), Agreement())
+        return agreement_of(self.every)
 
     @property
     def evidence(self) -> Evidence | None:
@@ -76,6 +83,11 @@ def evidence_of(checks: Sequence[RoomCheck]) -> Evidence | None:
     return total(known) if known else None
 
 
+def agreement_of(checks: Sequence[RoomCheck]) -> Agreement:
+    """Agreement summed over rooms."""
+    return sum((check.agreement for check in checks), Agreement())
+
+
 def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> FolderCheck:
     """Check the consistency of a folder of shards.
 
@@ -85,17 +97,18 @@ def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> Folder
     index = read_index(folder)
     name = str(index.get("label_set"))
     label_set(name)
-    usual, given, failures = given_of(folder, index.get("source"))
+    conventions, failures = read_conventions(folder, index.get("source"))
     problems = [f"{folder}: {failures}."] if failures and room_id is None else []
     rooms: dict[str, list[RoomCheck]] = {}
     for split in SPLITS:
         if not any((folder / split).glob("*.h5")):
             continue
-        paths = list_shards(folder, split)
-        arguments = [(folder, path, name, room_id, usual, given) for path in paths]
+        arguments = [
+            (folder, path, name, room_id, conventions) for path in list_shards(folder, split)
+        ]
         with pool(workers) as run:
-            rooms[split] = [room for part in run(_check_shard, arguments, f"checking {split}")
-                            for room in part]  # fmt: skip
+            parts = run(_check_shard, arguments, f"checking {split}")
+            rooms[split] = [room for part in parts for room in part]
     found = FolderCheck(rooms, ())
     if not found.every:
         raise InputError(
@@ -113,22 +126,20 @@ def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> Folder
     # If a room has no views, one of the problems already states the reason.
     if room_id is None and all(room.views for room in found.every):
         problems += _count_problems(folder, index, rooms)
-    problems += _verdict(folder, found.every, usual, given)
+    problems += _mistakes(folder, found.every, conventions)
     return replace(found, problems=tuple(problems))
 
 
-def _verdict(
-    folder: Path, rooms: Sequence[RoomCheck], usual: Given, given: dict[str, Given]
-) -> list[str]:
+def _mistakes(folder: Path, rooms: Sequence[RoomCheck], conventions: Conventions) -> list[str]:
     """A sentence on the mistake in the cameras and ids of all rooms, or sentences on the rooms that
     differ; if there are no such mistakes, sentences on the ground truth."""
 
     def mistake(checks: Sequence[RoomCheck]) -> Finding | None:
         if (evidence := evidence_of(checks)) is None:
             return None
-        origins = [given.get(check.room_id, usual) for check in checks]
-        names = [origin.file for origin in origins]
-        origin = origins[names.index(max(names, key=names.count))]
+        origins = [conventions.of(check.room_id) for check in checks]
+        files = [origin.file for origin in origins]
+        origin = origins[files.index(max(files, key=files.count))]
         return find_mistake(evidence, origin, lambda: _tracks_of(folder, checks))
 
     if (finding := mistake(rooms)) is not None:
@@ -145,47 +156,43 @@ def _verdict(
         more = f" and {len(checks) - _NAMED_ROOMS} more" * (len(checks) > _NAMED_ROOMS)
         which = "room" if len(checks) == 1 else f"{len(checks)} of {len(rooms)} rooms,"
         sentences.append(f"{folder}, {which} {named}{more}: {finding.sentence}.")
-    return sentences or _truth_verdict(folder, rooms, usual, given)
+    return sentences or _mistakes_in_3d(folder, rooms, conventions)
 
 
-def _tracks_of(folder: Path, checks: Sequence[RoomCheck]) -> Trial:
+def _tracks_of(folder: Path, checks: Sequence[RoomCheck]) -> TrackTrial:
     most = sorted(checks, key=lambda check: -check.views)[:_TRIED_ROOMS]
-    trials = []
-    for check in most:
-        with Shard(folder / check.shard) as shard:
-            trials.append(try_tracks(shard.read_room(check.room_id, images=True)))
-    return add(trials)
+    return try_tracks(_read(folder, check)[0] for check in most)
 
 
-def _truth_verdict(
-    folder: Path, rooms: Sequence[RoomCheck], usual: Given, given: dict[str, Given]
+def _read(folder: Path, check: RoomCheck) -> Room:
+    with Shard(folder / check.shard) as shard:
+        views = shard.read_room(check.room_id, images=True)
+        if not shard.has_ground_truth(check.room_id):
+            return Room(views)
+        return Room(views, true_bodies(views, shard.read_ground_truth(check.room_id), folder)[0])
+
+
+def _mistakes_in_3d(
+    folder: Path, rooms: Sequence[RoomCheck], conventions: Conventions
 ) -> list[str]:
     """Sentences about ground truth and masks, in all rooms together or in single ones."""
 
-    def trials(checks: Sequence[RoomCheck]) -> list[Any]:
-        found = []
-        for check in checks[:_TRIED_ROOMS]:
-            with Shard(folder / check.shard) as shard:
-                views = shard.read_room(check.room_id, images=True)
-                bodies, _ = true_bodies(views, shard.read_ground_truth(check.room_id), folder)
-            found.append(try_repairs(bodies, views, given.get(check.room_id, usual)))
-        return found
+    def said(agreement: Agreement, checks: Sequence[RoomCheck], **limits: Any) -> list[str]:
+        if not (kinds := agreement.failing(**limits)):
+            return []
+        first = checks[:_TRIED_ROOMS]
+        tried = [(_read(folder, check), conventions.of(check.room_id)) for check in first]
+        return [disagreement(agreement, kind, tried, **limits) for kind in kinds]
 
     sentences = []
     wrong = [room for room in rooms if room.agreement.failing()]
     if 2 * len(wrong) <= len(rooms):
         for room in rooms:
-            kinds = room.agreement.failing(ROOM_SHARE, ROOM_MASKS)
-            tried = trials([room]) if kinds else []
-            said = [
-                disagreement(room.agreement, kind, tried, ROOM_SHARE, ROOM_MASKS) for kind in kinds
-            ]
             where = f"{folder / room.shard}, room {room.room_id}"
-            sentences += [f"{where}: {sentence}." for sentence in said or room.outliers]
-    agreement = sum((room.agreement for room in rooms), Agreement())
-    if not sentences and (kinds := agreement.failing()):
-        tried = trials(wrong)
-        sentences = [f"{folder}: {disagreement(agreement, kind, tried)}." for kind in kinds]
+            found = said(room.agreement, [room], **_OF_ROOM) or room.outliers
+            sentences += [f"{where}: {sentence}." for sentence in found]
+    if not sentences:
+        sentences = [f"{folder}: {sentence}." for sentence in said(agreement_of(rooms), wrong)]
     return [text.replace("?.", "?") for text in sentences]
 
 
@@ -209,12 +216,7 @@ def _count_problems(
 
 
 def _check_shard(
-    folder: Path,
-    path: Path,
-    label_set_name: str,
-    only: str | None,
-    usual: Given,
-    given: dict[str, Given],
+    folder: Path, path: Path, label_set_name: str, only: str | None, conventions: Conventions
 ) -> list[RoomCheck]:
     """Check every room of a shard, or only `only`; an unreadable shard is one problem."""
     name = str(path.relative_to(folder))
@@ -226,14 +228,16 @@ def _check_shard(
                 checks.append(RoomCheck(name, "", problems=(f"{said} '{label_set_name}'",)))
             for room_id in shard.room_ids:
                 if only is None or room_id == only:
-                    origin = given.get(room_id, usual)
-                    checks.append(_check_room(shard, folder, name, room_id, origin))
+                    convention = conventions.of(room_id)
+                    checks.append(_check_room(shard, folder, name, room_id, convention))
     except ShardError as error:
         checks.append(RoomCheck(name, "", problems=(str(error).removesuffix("."),)))
     return checks
 
 
-def _check_room(shard: Shard, folder: Path, name: str, room_id: str, given: Given) -> RoomCheck:
+def _check_room(
+    shard: Shard, folder: Path, name: str, room_id: str, convention: Convention
+) -> RoomCheck:
     truth = None
     try:
         views = shard.read_room(room_id, images=True)
@@ -256,12 +260,13 @@ def _check_room(shard: Shard, folder: Path, name: str, room_id: str, given: Give
     )  # fmt: skip
     if wrong:
         return check
-    check = replace(check, evidence=room_evidence(views, given.convention, truth is None))
+    check = replace(check, evidence=room_evidence(views, convention, truth is None))
     if truth is None:
         return check
     bodies, found = true_bodies(views, truth, folder)
-    seen = compare(bodies, views)
-    odd = () if seen.agreement.failing(ROOM_SHARE, ROOM_MASKS) else outliers(bodies, views, seen)
+    room = Room(views, bodies)
+    seen = compare(room)
+    odd = () if seen.agreement.failing(**_OF_ROOM) else outliers(room, seen)
     return replace(
         check, problems=(*problems, *found), agreement=seen.agreement, outliers=tuple(odd)
     )
