@@ -25,7 +25,7 @@ from data_prep.front.recipe import load_recipe
 from data_prep.front.source import FrontSource
 from data_prep.homes.make import make_homes
 from data_prep.inspection.causes import GIVEN
-from data_prep.inspection.verdicts import what_was_checked
+from data_prep.inspection.diagnosis import what_was_checked
 from data_prep.inspection.verify import verify
 from data_prep.readers.posed.source import PosedSource
 from data_prep.readers.posed.views import PosedSettings

@@ -345,7 +345,7 @@ def run_job(job: "Job") -> None:
     from rich.console import Console
 
     from data_prep.engine.build import build_shards
-    from data_prep.engine.report_tables import report_tables
+    from data_prep.engine.report import report_tables
 
     try:
         summary = build_shards(job)

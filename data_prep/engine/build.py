@@ -1,24 +1,55 @@
 """Builds a folder of shards from a source, in parallel and resumable.
 
-Every `prep-*` command runs this engine. It prepares the source's rooms shard by shard
-(shard_job.py) in worker processes (workers.py), and writes a report at the end.
+Every `prep-*` command runs this engine. It prepares the source's rooms shard by shard in worker
+processes (workers.py), and writes a report at the end. `plan.json` is written first, and of each
+shard its models, its report and, last, the shard itself; files are whole or absent, so that a run
+may be killed anywhere and resumed by the same command.
 """
 
+import contextlib
+import errno
 import os
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from data_prep.engine.output import claimed, writing
-from data_prep.engine.plan import PLAN_NAME, Plan, ShardPlan, job_settings, read_plan
-from data_prep.engine.report import REPORT_FILES, Summary, finish
-from data_prep.engine.selection import is_asked_for
-from data_prep.engine.shard_job import ShardReport, make_shard, read_finished
-from data_prep.engine.source import Source
+from pydantic import TypeAdapter, ValidationError
+
+from data_prep.engine.plan import (
+    PLAN_NAME,
+    JobPlan,
+    ShardTask,
+    in_words,
+    is_asked_for,
+    job_settings,
+    read_plan,
+)
+from data_prep.engine.report import (
+    REPORT_FILES,
+    REPORT_NAME,
+    TABLE_NAME,
+    Summary,
+    line_of,
+    report_csv,
+)
+from data_prep.engine.source import Line, PreparedRoom, RoomTask, Source, sentence_of
 from data_prep.engine.workers import Run, pool
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import write_json
-from sceneprior.render.offscreen import open_renderer
+from sceneprior.core.files import (
+    json_text,
+    only_writer,
+    remove_parts,
+    write_changed,
+    write_json,
+    write_whole,
+)
+from sceneprior.core.scene import Mesh
+from sceneprior.core.shard_writing import check_views, shard_bytes
+from sceneprior.core.shards import INDEX_NAME, MODELS_FOLDER, RoomGroundTruth, RoomViews
+from sceneprior.render.offscreen import Renderer, open_renderer
+
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 @dataclass(frozen=True)
@@ -41,23 +72,20 @@ def build_shards(job: Job) -> Summary:
     with claimed(out), pool(job.workers or cores) as run:
         plan = read_plan(out, source, settings, job.renderer)
         if plan is None:
-            plan = _make_plan(source, settings, job, run)
+            kinds = run(_renderer_kind, [(job.renderer,)], None) if source.draws else iter([None])
+            settings["renderer"] = next(kinds)
+            survey = source.survey(run)
+            plan = JobPlan(settings, survey.rooms, survey.left_out)
             with writing(out):
                 write_json(out / PLAN_NAME, asdict(plan))
         return _carry_out(replace(job, out=out), plan, run)
-
-
-def _make_plan(source: Source, settings: dict[str, Any], job: Job, run: Run) -> Plan:
-    kind = next(run(_renderer_kind, [(job.renderer,)], None)) if source.draws else None
-    survey = source.survey(run)
-    return Plan({**settings, "renderer": kind}, survey.rooms, survey.left_out)
 
 
 def _renderer_kind(kind: str) -> str:
     return open_renderer(kind).kind
 
 
-def _carry_out(job: Job, plan: Plan, run: Run) -> Summary:
+def _carry_out(job: Job, plan: JobPlan, run: Run) -> Summary:
     source, out = job.source, job.out
     shards = plan.shards(source.room_type)
     reports: dict[str, ShardReport] = {}
@@ -83,7 +111,7 @@ def _carry_out(job: Job, plan: Plan, run: Run) -> Summary:
     open_shards = len(shards) - len(reports)
     totals = Summary(source, lines, drawn, len(missing), kept, open_shards)
     if not open_shards:
-        finish(out, plan, totals)
+        _finish(out, plan, totals)
     if plan.settings["only"] == source.only:
         return totals
     # With `--only` in a larger folder, the summary covers the requested part alone.
@@ -91,7 +119,7 @@ def _carry_out(job: Job, plan: Plan, run: Run) -> Summary:
     return replace(totals, lines=asked)
 
 
-def _asked_for(source: Source, plan: Plan, shards: list[ShardPlan]) -> list[ShardPlan]:
+def _asked_for(source: Source, plan: JobPlan, shards: list[ShardTask]) -> list[ShardTask]:
     """Shards that hold a room selected by `--only`, if the folder was planned without that option;
     otherwise all shards."""
     if plan.settings["only"] == source.only:
@@ -111,3 +139,156 @@ def _asked_for(source: Source, plan: Plan, shards: list[ShardPlan]) -> list[Shar
             f"--only {source.only} selects no room of the plan{whys[0] if whys else ''}."
         )
     return chosen
+
+
+@dataclass(frozen=True)
+class ShardReport:
+    """Outcome of a shard's rooms, as stored in `<shard>.report.json`."""
+
+    renderer: str | None
+    """Name of the renderer; None if nothing was drawn."""
+    lines: list[Line]
+
+    def has(self, status: str) -> bool:
+        """Test whether any room has this status: prepared, filtered or failed."""
+        return any(line.status == status for line in self.lines)
+
+
+def make_shard(
+    source: Source, out: Path, renderer_kind: str | None, shard: ShardTask
+) -> ShardReport:
+    """Prepare the rooms of one shard and write it.
+
+    Models are written first, then the report, then the shard, so that a shard with a report is
+    complete (`read_finished`).
+    """
+    path = out / shard.name
+    first, last = shard.rooms[0].room_id, shard.rooms[-1].room_id
+    with writing(out, f"rooms {first} to {last}"):
+        # The report is deleted first, so that the shard counts as unfinished if the job stops here.
+        _report_path(path).unlink(missing_ok=True)
+        path.unlink(missing_ok=True)
+        renderer = None if renderer_kind is None else open_renderer(renderer_kind)
+        report = ShardReport(renderer.name if renderer else None, [])
+        rooms = _prepared(source, out, renderer, shard, report.lines)
+        data = shard_bytes(shard.name, source.label_set, rooms)
+        write_json(_report_path(path), asdict(report))
+        if report.has("prepared"):
+            write_whole(path, data)
+    return report
+
+
+def read_finished(shard: Path) -> ShardReport | None:
+    """Read the report of a finished shard; None if the shard must still be made."""
+    try:
+        report = TypeAdapter(ShardReport).validate_json(_report_path(shard).read_bytes())
+    except (OSError, ValidationError):
+        return None
+    return report if shard.is_file() or not report.has("prepared") else None
+
+
+def _report_path(shard: Path) -> Path:
+    return shard.with_suffix(".report.json")
+
+
+def _prepared(
+    source: Source, out: Path, renderer: Renderer | None, shard: ShardTask, lines: list[Line]
+) -> Iterator[tuple[RoomViews, RoomGroundTruth | None]]:
+    """Prepare the shard's rooms one by one, write their models, append outcomes to `lines`."""
+    for task in shard.rooms:
+        result = _prepare(source, task, renderer)
+        lines.append(line_of(result, task, source.label_set))
+        if isinstance(result, Line):
+            continue
+        for model_id, mesh in result.models.items():
+            _write_model(out / MODELS_FOLDER / f"{model_id}.ply", mesh)
+        for name, data in result.files.items():
+            write_whole(out / name, data)
+        yield result.views, result.truth
+
+
+def _prepare(source: Source, task: RoomTask, renderer: Renderer | None) -> PreparedRoom | Line:
+    """Prepare one room; any exception becomes the failure of this room alone."""
+    try:
+        result = source.prepare(task, renderer)
+        if isinstance(result, PreparedRoom):
+            check_views(task.house, result.views)
+        return result
+    except Exception as error:
+        return Line(task.room_id, task.house, "failed", reason=sentence_of(error))
+
+
+def _write_model(path: Path, mesh: Mesh) -> None:
+    if path.is_file():
+        return
+    import trimesh
+
+    bare = trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False)
+    write_whole(path, trimesh.exchange.ply.export_ply(bare, encoding="binary", vertex_normal=False))
+
+
+def _finish(out: Path, plan: JobPlan, totals: Summary) -> None:
+    """Write the report, then the index, which marks the folder as finished.
+
+    If no room was prepared, or none of `train`, only the report is written and an `InputError`
+    raised.
+    """
+    if plan.settings["only"] is None and totals.source.only is not None:
+        # A run with `--only` made the last missing shard: report on the whole data set.
+        whole: Any = replace(totals.source, only=None)  # type: ignore[type-var]
+        totals = replace(totals, source=whole)
+    with writing(out):
+        write_changed(out / REPORT_NAME, json_text(totals.report))
+        write_changed(out / TABLE_NAME, report_csv(totals.lines))
+    # Rules on mesh positions may leave a small `val` or `test` empty, but not `train`.
+    planned = any(room.split == "train" for room in plan.rooms) and plan.settings["only"] is None
+    why = in_words(line for line in totals.lines if line.status != "prepared")
+    if planned and not totals.counts["train"]["rooms"]:
+        raise InputError(
+            f"The 'train' split is empty: all its rooms failed or were filtered ({why}); see "
+            f"{out}/{TABLE_NAME}."
+        )
+    if not totals.statuses.get("prepared"):
+        raise InputError(f"No room was prepared ({why}); see {out}/{TABLE_NAME}.")
+    index = {
+        "format": "sceneprior-shards",
+        "version": 1,
+        "source": totals.source.name,
+        "label_set": totals.source.label_set,
+        "room_type": totals.source.room_type,
+        "counts": totals.counts,
+        "seed": plan.settings.get("seed"),
+        "recipe": plan.settings.get("recipe"),
+        "renderer": totals.renderer,
+    }
+    with writing(out):
+        write_changed(out / INDEX_NAME, json_text(index))
+
+
+@contextlib.contextmanager
+def claimed(out: Path) -> Iterator[None]:
+    """Lock `out` for this run, and remove the partial files of a killed run."""
+    with contextlib.ExitStack() as until_done:
+        with writing(out):
+            until_done.enter_context(only_writer(out))
+            remove_parts(out)
+        try:
+            yield
+        finally:
+            with contextlib.suppress(OSError):
+                remove_parts(out)  # partial files of workers that died
+
+
+@contextlib.contextmanager
+def writing(out: Path, what: str = "") -> Iterator[None]:
+    """Turn an OSError into an InputError that names the lost work, `what`, and how to continue."""
+    try:
+        yield
+    except OSError as error:
+        where = error.filename or out
+        about = f" ({what})" if what else ""
+        advice = "free space on the disk and " if error.errno in _FULL else ""
+        raise InputError(
+            f"{where}{about} cannot be written ({error.strerror or error}). "
+            f"Finished shards are kept: {advice}run the same command again to continue."
+        ) from None

@@ -1,4 +1,4 @@
-"""The outcome of every room, and its files: report.json, report.csv and, last, index.json."""
+"""The outcome of every room: as report.json, as report.csv, and as tables for the terminal."""
 
 import csv
 import io
@@ -6,22 +6,23 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
-from data_prep.engine.output import writing
-from data_prep.engine.plan import Plan
-from data_prep.engine.selection import in_words
+from rich.table import Column, Table
+from rich.text import Text
+
 from data_prep.engine.source import SPLITS, Expected, Line, PreparedRoom, RoomTask, Source
 from sceneprior.core.classes import label_set
-from sceneprior.core.errors import InputError
-from sceneprior.core.files import json_text, write_changed
 from sceneprior.core.shards import INDEX_NAME
 
 REPORT_NAME = "report.json"
 TABLE_NAME = "report.csv"
 REPORT_FILES = (INDEX_NAME, REPORT_NAME, TABLE_NAME)
 """Files of a finished folder, in the order of their deletion when work begins again."""
+_FAILURES_SHOWN = 10
+_NOTES_SHOWN = 10
+_COUNTS = ("rooms", "views", "objects")
+_MEANS = ("views_per_room", "objects_per_room", "objects_per_view")
 _COLUMNS = ("room_id", "house", "split", "status", "rule", "reason", "views", "objects", "notes")
 
 
@@ -205,39 +206,65 @@ class Summary:
         return "; ".join(parts) + (f"; {left_out} ({TABLE_NAME} says why)" if left_out else "")
 
 
-def finish(out: Path, plan: Plan, totals: Summary) -> None:
-    """Write the report, then the index, which marks the folder as finished.
+def make_table(
+    columns: Iterable[Column | str], rows: Iterable[Iterable[Any]], caption: str | None = None
+) -> Table:
+    """Format rows of texts and numbers as a table."""
+    table = Table(*columns, caption=caption)
+    for row in rows:
+        # Cells are `Text`, because rich parses [brackets] in plain strings as markup.
+        table.add_row(*(Text(str(cell)) for cell in row))
+    return table
 
-    If no room was prepared, or none of `train`, only the report is written and an `InputError`
-    raised.
-    """
-    if plan.settings["only"] is None and totals.source.only is not None:
-        # A run with `--only` made the last missing shard: report on the whole data set.
-        whole: Any = replace(totals.source, only=None)  # type: ignore[type-var]
-        totals = replace(totals, source=whole)
-    with writing(out):
-        write_changed(out / REPORT_NAME, json_text(totals.report))
-        write_changed(out / TABLE_NAME, report_csv(totals.lines))
-    # Rules on mesh positions may leave a small `val` or `test` empty, but not `train`.
-    planned = any(room.split == "train" for room in plan.rooms) and plan.settings["only"] is None
-    why = in_words(line for line in totals.lines if line.status != "prepared")
-    if planned and not totals.counts["train"]["rooms"]:
-        raise InputError(
-            f"The 'train' split is empty: all its rooms failed or were filtered ({why}); see "
-            f"{out}/{TABLE_NAME}."
-        )
-    if not totals.statuses.get("prepared"):
-        raise InputError(f"No room was prepared ({why}); see {out}/{TABLE_NAME}.")
-    index = {
-        "format": "sceneprior-shards",
-        "version": 1,
-        "source": totals.source.name,
-        "label_set": totals.source.label_set,
-        "room_type": totals.source.room_type,
-        "counts": totals.counts,
-        "seed": plan.settings.get("seed"),
-        "recipe": plan.settings.get("recipe"),
-        "renderer": totals.renderer,
-    }
-    with writing(out):
-        write_changed(out / INDEX_NAME, json_text(index))
+
+def report_tables(report: dict[str, Any]) -> list[Table]:
+    """Format the report of `make_report` as tables, from outcomes to expected counts."""
+    means, statuses = report["per_split"], report["statuses"]
+    outcomes = [
+        ("found", report["found"]),
+        ("prepared", statuses.get("prepared", 0)),
+        *((f"filtered by {rule}", group["rooms"]) for rule, group in report["filtered"].items()),
+        ("failed", statuses.get("failed", 0)),
+    ]
+    if report["with_notes"]:
+        outcomes.append(("prepared with notes", report["with_notes"]))
+    splits = [
+        (split, *(counts[key] for key in _COUNTS), *(f"{means[split][key]:.2f}" for key in _MEANS))
+        for split, counts in report["counts"].items()
+    ]
+    classes = [
+        (name, *(means[split]["classes"].get(name, 0) for split in report["counts"]))
+        for name, _ in _most_first(report["classes"])
+    ]
+    tables = [
+        make_table(("rooms", ""), outcomes),
+        make_table(
+            ("split", *_COUNTS, "views per room", "objects per room", "objects per view"), splits
+        ),
+        make_table(("class", *report["counts"]), classes),
+    ]
+    if notes := [*report["notes"].items()]:
+        more = [(f"and {len(notes) - _NOTES_SHOWN} more: report.csv", "")]
+        rows = notes[:_NOTES_SHOWN] + more * (len(notes) > _NOTES_SHOWN)
+        about = Column("note of prepared rooms", overflow="fold")
+        tables.append(make_table((about, "rooms"), rows))
+    if unknown := _most_first(report["unknown_categories"]):
+        why = "counted as void: the recipe does not list them"
+        tables.append(make_table(("category without a class", "pieces"), unknown, why))
+    if failed := [(item["room_id"], item["reason"]) for item in report["failed"]]:
+        more = [(f"and {len(failed) - _FAILURES_SHOWN} more", "report.csv lists all of them")]
+        rows = failed[:_FAILURES_SHOWN] + more * (len(failed) > _FAILURES_SHOWN)
+        tables.append(make_table((Column("failed", overflow="fold"), "why"), rows))
+    if "expected" in report:
+        rows = [
+            (row["what"], row["expected"], row["found"],
+             f"{row['difference']:+d}" if row["difference"] else "as expected")
+            for row in report["expected"]["rows"]
+        ]  # fmt: skip
+        columns = ("count", "expected", "found", "difference")
+        tables.append(make_table(columns, rows, report["expected"]["of"] or None))
+    return tables
+
+
+def _most_first(counts: dict[str, int]) -> list[tuple[str, int]]:
+    return sorted(counts.items(), key=lambda item: (-item[1], item[0]))

@@ -7,8 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from data_prep.engine.plan import digest, digest_of_files
-from data_prep.engine.selection import house_may_match, read_splits, seeded_split, select
+from data_prep.engine.plan import (
+    digest,
+    digest_of_files,
+    house_may_match,
+    read_splits,
+    seeded_split,
+    select,
+)
 from data_prep.engine.source import (
     SPLITS,
     Expected,

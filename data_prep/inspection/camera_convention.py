@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from data_prep.engine.plan import in_words
 from data_prep.engine.report import REPORT_NAME
-from data_prep.engine.selection import in_words
 from data_prep.engine.source import Line
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rich.table import Column, Table
 
-from data_prep.engine.report_tables import make_table
+from data_prep.engine.report import make_table
 from data_prep.engine.source import SPLITS
 from data_prep.inspection.agreement import KINDS
 from data_prep.inspection.causes import CHANCE, GIVEN

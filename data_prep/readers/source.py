@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from data_prep.engine.plan import digest
-from data_prep.engine.selection import (
+from data_prep.engine.plan import (
+    digest,
     house_may_match,
     of_one_size,
     read_splits,

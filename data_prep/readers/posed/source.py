@@ -4,8 +4,14 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
-from data_prep.engine.plan import digest, digest_of_files
-from data_prep.engine.selection import house_may_match, of_one_size, seeded_split, select
+from data_prep.engine.plan import (
+    digest,
+    digest_of_files,
+    house_may_match,
+    of_one_size,
+    seeded_split,
+    select,
+)
 from data_prep.engine.source import Expected, Line, PreparedRoom, RoomTask, Survey, sentence_of
 from data_prep.engine.workers import Run
 from data_prep.readers.posed.cameras import seems_up

@@ -5,8 +5,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
-from data_prep.engine.plan import digest
-from data_prep.engine.selection import house_may_match, seeded_split, select
+from data_prep.engine.plan import digest, house_may_match, seeded_split, select
 from data_prep.engine.source import Expected, Line, PreparedRoom, RoomTask, Survey
 from data_prep.engine.workers import Run
 from data_prep.readers.heading import find_turn, note_of_turn

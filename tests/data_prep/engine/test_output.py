@@ -12,8 +12,7 @@ from front_files import bedroom
 from front_jobs import digests, front_job, three_houses
 from toy_source import ToySource
 
-from data_prep.engine.build import Job, build_shards
-from data_prep.engine.output import claimed
+from data_prep.engine.build import Job, build_shards, claimed
 from sceneprior.core import files
 from sceneprior.core.errors import InputError
 

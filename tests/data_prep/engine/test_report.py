@@ -10,8 +10,7 @@ from front_jobs import front_job, rooms_of, three_houses
 from rich.console import Console
 
 from data_prep.engine.build import build_shards
-from data_prep.engine.report import compare, make_report
-from data_prep.engine.report_tables import report_tables
+from data_prep.engine.report import compare, make_report, report_tables
 from data_prep.engine.source import Expected, Line
 from data_prep.front.recipe import load_recipe
 from sceneprior.core.errors import InputError

@@ -7,7 +7,7 @@ from front_files import room
 from front_jobs import front_job, three_houses
 
 from data_prep.engine.build import build_shards
-from data_prep.engine.selection import house_may_match, is_asked_for, seeded_split
+from data_prep.engine.plan import house_may_match, is_asked_for, seeded_split
 from sceneprior.core.errors import InputError
 from sceneprior.core.shards import list_shards
 

@@ -8,8 +8,7 @@ from front_files import bedroom, room
 from front_jobs import digests, front_job, rooms_of
 from toy_source import ToySource
 
-from data_prep.engine.build import Job, build_shards
-from data_prep.engine.shard_job import read_finished
+from data_prep.engine.build import Job, build_shards, read_finished
 from sceneprior.core.errors import InputError
 from sceneprior.core.shards import read_index
 

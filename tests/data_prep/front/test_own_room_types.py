@@ -13,7 +13,7 @@ from pages import ROOT, first_block, run_first_commands
 from toy_metrics import without_classifiers
 
 from data_prep.engine.build import Job, build_shards
-from data_prep.engine.report_tables import report_tables
+from data_prep.engine.report import report_tables
 from data_prep.front.recipe import load_recipe
 from data_prep.front.source import FrontSource
 from sceneprior.apps.retrieval.cad_models import open_models
