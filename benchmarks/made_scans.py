@@ -25,7 +25,7 @@ from handheld import swayed, walk
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from data_prep.engine.selection import read_splits
+from data_prep.engine.plan import read_splits
 from data_prep.front.furnished import Room
 from data_prep.front.houses import house_files
 from data_prep.front.models import ModelBank

@@ -86,7 +86,7 @@ OWNERS = {
     "scipy.optimize": [
         "sceneprior/core/overlaps.py", "sceneprior/core/geometry/part_blends.py",
         "sceneprior/paper/matching.py",
-        "sceneprior/evaluation/", "data_prep/inspection/truth_causes.py",
+        "sceneprior/evaluation/", "data_prep/inspection/causes.py",
     ],
     "cv2": ["data_prep/readers/posed/lens.py", "sceneprior/evaluation/metrics/"],
     "viser": ["sceneprior/apps/viewer/"],

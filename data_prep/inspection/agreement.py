@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from data_prep.upright import own_sides
+from data_prep.readers.upright import own_sides
 from sceneprior.core.cameras import to_camera, to_pixels
 from sceneprior.core.errors import ShardError
 from sceneprior.core.geometry.corners import BOX_EDGES, box_corners

@@ -97,7 +97,8 @@ def wire_pixels(
     share = np.where(low < NEAR_M, (NEAR_M - low) / np.where(high > low, high - low, 1), 0.0)
     nearer = ends[..., 2] < NEAR_M
     ends += nearer[..., None] * share[:, None, None] * (ends[:, ::-1] - ends)
-    return [tuple(line) for line in to_pixels(ends, intrinsics).round(6).reshape(-1, 4).tolist()]
+    lines = to_pixels(ends.reshape(-1, 3), intrinsics.astype(np.float64)).round(6).reshape(-1, 4)
+    return [tuple(line) for line in lines.tolist()]
 
 
 def draw_plan(shard: Shard, room_id: str, width_px: int = 480, height_px: int = 360) -> Image.Image:

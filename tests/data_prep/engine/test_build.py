@@ -9,7 +9,7 @@ from front_reading import shared_front
 from data_prep.engine.build import Job, build_shards
 from data_prep.front.recipe import load_recipe
 from data_prep.front.source import FrontSource
-from data_prep.inspection.bodies import true_bodies
+from data_prep.inspection.agreement import true_bodies
 from data_prep.inspection.verify import verify
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError

@@ -7,11 +7,26 @@ import numpy as np
 import pytest
 from front_jobs import bedroom_shards, rooms_of
 
-from data_prep.inspection.agreement import MARGIN, Agreement, Tally, compare, compare_boxes
-from data_prep.inspection.bodies import hull_of_model, true_bodies
+from data_prep.front.viewpoints import camera_pose
+from data_prep.inspection.agreement import (
+    MARGIN,
+    NEAR_M,
+    Agreement,
+    Hull,
+    Room,
+    Tally,
+    box_iou_2d,
+    boxes_around,
+    compare,
+    compare_boxes,
+    hull_of,
+    hull_of_model,
+    true_bodies,
+)
 from sceneprior.core.errors import ShardError
 
 LARGER = ("views.image_size=[180, 240]", "views.per_m2=2")
+K = np.array([[100.0, 0, 60], [0, 100, 45], [0, 0, 1]])
 
 
 @pytest.fixture(scope="module")
@@ -22,12 +37,22 @@ def made(made_once):
     return *pair, folder
 
 
-def test_whole_things_are_those_that_nothing_cuts_off(made):
-    views, _, _ = made
-    bodies, _ = true_bodies(*made)
-    seen = compare(bodies, views)
+def room_of(views, truth, shards):
+    bodies, problems = true_bodies(views, truth, shards)
+    return Room(views, bodies), problems
+
+
+def test_a_right_room_agrees_to_the_pixel(made):
+    views = made[0]
+    room, problems = room_of(*made)
+    seen = compare(room)
+    assert problems == [] and set(seen.kinds) == {"mesh"} and (seen.judged == views.visible).all()
+    assert seen.iou[seen.judged & seen.whole].min() > 0.85
+    tally = seen.agreement.of("mesh")
+    # What is hidden in part lies within its projection, too.
+    assert tally.share == 1.0 and tally.masks == views.visible.sum() and tally.mean_iou > 0.95
     height, width = views.image_size
-    assert 3 < seen.whole.sum() < views.visible.sum() and (seen.judged == views.visible).all()
+    assert 3 < seen.whole.sum() < views.visible.sum()
     for view, k in zip(*np.nonzero(seen.whole), strict=True):
         rows, columns = np.nonzero(views.instance_ids[view] == k + 1)
         assert rows.min() > 0 and rows.max() < height - 1
@@ -35,35 +60,24 @@ def test_whole_things_are_those_that_nothing_cuts_off(made):
         assert views.sides_clear[view, k].all()
 
 
-def test_a_right_room_agrees_to_the_pixel(made):
-    bodies, problems = true_bodies(*made)
-    seen = compare(bodies, made[0])
-    assert problems == [] and set(seen.kinds) == {"mesh"}
-    assert seen.iou[seen.judged & seen.whole].min() > 0.85
-    tally = seen.agreement.of("mesh")
-    # What is hidden in part lies within its projection, too.
-    assert tally.share == 1.0 and tally.masks == made[0].visible.sum() and tally.mean_iou > 0.95
-
-
 def test_without_meshes_the_boxes_stand_for_them(made):
     views, truth, shards = made
     bare = replace(truth, model_ids=("",) * len(truth.model_ids))
-    bodies, problems = true_bodies(views, bare, shards)
+    room, problems = room_of(views, bare, shards)
     # These pieces are boxes themselves, though some are turned in theirs.
-    tally = compare(bodies, views).agreement.of("box")
+    tally = compare(room).agreement.of("box")
     assert problems == [] and tally.share == 1.0 and tally.mean_iou > 0.85
 
 
 def test_what_is_undefined_disagrees_and_the_margin_is_what_it_says(made):
-    views, _, _ = made
-    bodies, _ = true_bodies(*made)
-    height, width = views.image_size
-    boxes = views.boxes * np.array([width, height, width, height], dtype=float)
-    margin = MARGIN * width
+    views = made[0]
+    room, _ = room_of(*made)
+    boxes = views.boxes * np.tile(room.size_px, 2)
+    margin = MARGIN * room.size_px[0]
     for grow, share in ((0.0, 1.0), (-0.99 * margin, 1.0), (-1.01 * margin, 0.0), (50, 1.0)):
         wider = boxes + np.array([-grow, -grow, grow, grow])
-        assert compare_boxes(bodies, wider, views).agreement.of("mesh").share == share
-    behind = compare_boxes(bodies, np.full(boxes.shape, np.nan), views).agreement.of("mesh")
+        assert compare_boxes(room, wider).agreement.of("mesh").share == share
+    behind = compare_boxes(room, np.full(boxes.shape, np.nan)).agreement.of("mesh")
     assert behind.masks == views.visible.sum() and behind.share == behind.mean_iou == 0.0
     assert Agreement({"mesh": behind}).failing() == ["mesh"]
 
@@ -79,8 +93,8 @@ def test_models_that_are_missing_or_damaged_are_named(made, tmp_path):
         with pytest.raises(ShardError, match=r"\.ply is not a triangle mesh \(\w+: "):
             hull_of_model(path)
     path.unlink()
-    bodies, problems = true_bodies(views, truth, shards)
-    assert None in bodies and not compare(bodies, views).judged[:, bodies.index(None)].any()
+    room, problems = room_of(views, truth, shards)
+    assert None in room.bodies and not compare(room).judged[:, room.bodies.index(None)].any()
     assert ".ply is missing, but a room's ground truth refers to it" in problems[0]
 
 
@@ -97,8 +111,46 @@ def test_a_mirrored_truth_does_not_agree(made):
     views, truth, shards = made
     mirror = np.diag([-1.0, 1, 1, 1])
     moved = replace(truth, model_to_room=(mirror @ truth.model_to_room).astype(np.float32))
-    bodies, problems = true_bodies(views, moved, shards)
-    tally = compare(bodies, views).agreement.of("mesh")
+    room, problems = room_of(views, moved, shards)
+    tally = compare(room).agreement.of("mesh")
     assert tally.masks == views.visible.sum() and tally.mean_iou < 0.6
     assert Agreement({"mesh": tally}).failing() == ["mesh"]
     assert len(problems) >= 2 and "m from the box around its placed mesh" in problems[0]
+
+
+def test_a_hull_projects_as_all_of_its_points_do(numbers):
+    points = numbers.normal(size=(500, 3)) * (1.0, 0.5, 0.1)
+    hull = hull_of(points)
+    assert len(hull.points_m) < 150
+    near = camera_pose(np.array([0.0, 0.1, -0.6]), 0.0, 0.1)  # some points lie behind it
+    for camera in (camera_pose(np.array([0.3, 1.5, -3.0]), 0.2, 0.3), near):
+        here = points @ camera[:3, :3].T + camera[:3, 3]
+        # All lines between points, cut at the near plane: slow, and the same.
+        a, b = (here[rows] for rows in np.triu_indices(len(here), 1))
+        cross = (a[:, 2] < NEAR_M) != (b[:, 2] < NEAR_M)
+        a, b = a[cross], b[cross]
+        cut = a + (b - a) * ((NEAR_M - a[:, 2:]) / (b[:, 2:] - a[:, 2:]))
+        seen = np.concatenate([here[here[:, 2] >= NEAR_M], cut]) @ K.T
+        pixels = seen[:, :2] / seen[:, 2:]
+        (box,) = boxes_around(hull, camera[None], K[None])
+        np.testing.assert_allclose(box, [*pixels.min(axis=0), *pixels.max(axis=0)], rtol=1e-6)
+    behind = Hull(-np.abs(points), hull_of(points).edges[:0])
+    assert np.isnan(boxes_around(behind, np.eye(4)[None], K[None])).all()
+
+
+@pytest.mark.parametrize("flat", [(1, 0, 1), (1, 1, 0), (0, 0, 1), (0, 0, 0)])
+def test_flat_things_have_a_hull(flat, numbers):
+    points = numbers.normal(size=(30, 3)) * flat
+    hull = hull_of(points)
+    np.testing.assert_allclose(hull.points_m.min(axis=0), points.min(axis=0), atol=1e-9)
+    np.testing.assert_allclose(hull.points_m.max(axis=0), points.max(axis=0), atol=1e-9)
+
+
+def test_overlap_of_boxes():
+    unit = np.array([0.0, 0, 1, 1])
+    for other, expected in (
+        (unit, 1.0), ([0.5, 0, 1.5, 1], 1 / 3), ([1, 0, 2, 1], 0.0), ([3, 3, 4, 4], 0.0),
+        ([0.25, 0.25, 0.75, 0.75], 0.25),
+    ):  # fmt: skip
+        assert box_iou_2d(unit, np.array(other)) == pytest.approx(expected, abs=1e-15)
+    assert np.isnan(box_iou_2d(unit, np.full(4, np.nan)))

@@ -4,10 +4,41 @@ import numpy as np
 import pytest
 from front_jobs import bedroom_shards
 
-from data_prep.inspection.pictures import AXES, BACKGROUND, FLOOR, WALL, draw_plan, draw_view
-from data_prep.inspection.projection import wire_pixels
+from data_prep.front.viewpoints import camera_pose
+from data_prep.inspection.agreement import NEAR_M
+from data_prep.inspection.pictures import (
+    AXES,
+    BACKGROUND,
+    FLOOR,
+    WALL,
+    draw_plan,
+    draw_view,
+    wire_pixels,
+)  # fmt: skip
 from sceneprior.core.geometry.corners import BOX_EDGES, box_corners
 from sceneprior.core.shards import Shard, list_shards
+
+K = np.array([[100.0, 0, 60], [0, 100, 45], [0, 0, 1]])
+
+
+def test_wires_join_projected_points(numbers):
+    camera = camera_pose(np.array([0.3, 1.5, -3.0]), 0.2, 0.3)
+    points = box_corners(numbers.normal(size=3) * 0.2, np.array([1.0, 0.5, 0.8]))
+    here = points @ camera[:3, :3].T + camera[:3, 3]
+    pixels = here @ K.T
+    pixels = pixels[:, :2] / pixels[:, 2:]
+    for line, (a, b) in zip(wire_pixels(points, BOX_EDGES, camera, K), BOX_EDGES, strict=True):
+        np.testing.assert_allclose(line, [*pixels[a], *pixels[b]], atol=1e-5)  # rounded to 1e-6
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_line_through_the_camera_is_cut_where_it_becomes_visible(turned):
+    line = np.array([[0.0, 0.1, -2.0], [0.0, 0.1, 2.0]])[:: -1 if turned else 1]
+    ((u1, v1, u2, v2),) = wire_pixels(line, [(0, 1)], np.eye(4), K)
+    ends = [(u1, v1), (u2, v2)][:: -1 if turned else 1]
+    assert ends[0] == pytest.approx((60, 45 + 100 * 0.1 / NEAR_M))
+    assert ends[1] == pytest.approx((60, 50))
+    assert wire_pixels(-np.abs(line), [(0, 1)], np.eye(4), K) == []
 
 
 @pytest.fixture

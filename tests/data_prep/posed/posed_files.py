@@ -11,7 +11,7 @@ from PIL import Image
 from scan_files import BOX_FACES
 
 from data_prep.engine.source import PreparedRoom
-from data_prep.inspection.projection import box_iou_2d, boxes_around, hull_of
+from data_prep.inspection.agreement import box_iou_2d, boxes_around, hull_of
 from data_prep.readers.posed.formats import read_formats
 from data_prep.readers.posed.source import PosedSource
 from data_prep.readers.posed.views import PosedSettings, prepare_posed

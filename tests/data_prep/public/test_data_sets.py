@@ -20,7 +20,7 @@ from public_files import (
 )
 
 from data_prep.engine.workers import pool
-from data_prep.inspection.projection import boxes_around, hull_of
+from data_prep.inspection.agreement import boxes_around, hull_of
 from data_prep.readers.frames import GL_TO_CV, Y_UP
 from data_prep.readers.heading import turn_matrix
 from data_prep.readers.rooms import FramedRoom, prepare_room

@@ -11,7 +11,7 @@ from room_scans import ROOM_TABLE, make_room_scan
 from scan_files import png, write_table, write_zip
 
 from data_prep.engine.build import Job, build_shards
-from data_prep.inspection.bodies import true_bodies
+from data_prep.inspection.agreement import true_bodies
 from data_prep.inspection.verify import verify
 from data_prep.readers.scannet.labels import read_labels
 from data_prep.readers.scannet.occlusion import unoccluded

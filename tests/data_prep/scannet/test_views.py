@@ -17,7 +17,7 @@ from scan_files import (
     write_zip,
 )
 
-from data_prep.inspection.projection import box_iou_2d
+from data_prep.inspection.agreement import box_iou_2d
 from data_prep.readers.scannet.scans import FULL_SIZE, QUARTER_SIZE, ScanSettings, read_scan
 from data_prep.readers.scannet.views import instance_images, prepare_scan
 from sceneprior.core.classes import STUFF, label_set
