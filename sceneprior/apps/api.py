@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sceneprior import __version__
 from sceneprior.apps.config import load_any_run, weights_of, with_latents
-from sceneprior.apps.priors.where import name_of, version_of
+from sceneprior.apps.priors.packed import name_of, version_of
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
@@ -300,7 +300,7 @@ class Prior:
 
 
 def _with_models(rooms: list[Scene], given: Sequence[SceneObject]) -> list[Scene]:
-    from sceneprior.apps.retrieval.made_models import with_models
+    from sceneprior.apps.retrieval.retrieve import with_models
 
     return with_models(rooms, given)
 

@@ -9,8 +9,7 @@ import pkgutil
 from pathlib import Path
 from typing import Any
 
-from sceneprior.apps.priors.packed import is_packed, read_packed, unpack
-from sceneprior.apps.priors.where import find_prior
+from sceneprior.apps.priors.packed import find_prior, is_packed, read_packed, unpack
 from sceneprior.core.errors import ConfigError, InputError
 from sceneprior.core.settings import check_settings, read_settings, shortened
 from sceneprior.paper.prior import TrainedPrior

@@ -172,8 +172,7 @@ def retrieve(
     from rich.console import Console
     from rich.progress import track
 
-    from sceneprior.apps.retrieval.cad_models import open_models
-    from sceneprior.apps.retrieval.made_models import made_models
+    from sceneprior.apps.retrieval.cad_models import made_models, open_models
     from sceneprior.apps.retrieval.retrieve import retrieval_report, retrieve_all
     from sceneprior.apps.rooms import write_scenes
     from sceneprior.core.files import write_json

@@ -116,7 +116,7 @@ def note_unmet(scenes: Sequence["Scene"]) -> None:
 
 def result_file(run: str, out: Path | None, name: str) -> Path:
     """The file of a run's results: `out` if given, else `name` in the run's folder."""
-    from sceneprior.apps.priors.where import find_prior
+    from sceneprior.apps.priors.packed import find_prior
 
     if out is not None:
         return checked_target(out)

@@ -80,8 +80,7 @@ def priors(
     ] = None,
 ) -> None:
     """List the priors that the package ships, or print the card of one prior."""
-    from sceneprior.apps.priors.packed import is_packed, read_packed
-    from sceneprior.apps.priors.where import find_prior, shipped_priors
+    from sceneprior.apps.priors.packed import find_prior, is_packed, read_packed, shipped_priors
 
     if name is not None:
         path = find_prior(name)

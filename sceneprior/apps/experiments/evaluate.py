@@ -2,6 +2,7 @@
 
 import csv
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -47,10 +48,7 @@ def evaluate_run(
     use: UseOptions | None = None,
     asked: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Score generated rooms against test rooms, and write the scores.
-
-    If the run keeps the latents of its training rooms, these rooms are decoded and scored as well:
-    against their 3D ground truth or, if the shards have none, against the observed masks.
+    """Score generated rooms against test rooms (`_scores`), and write the scores.
 
     The options' seed also draws the latents; `shards` and `distribution` default to the run's.
 
@@ -59,46 +57,27 @@ def evaluate_run(
         asked: Request for the rooms, as arguments of `Prior.sample`; only with `use`.
     """
     trained = load_any_run(run)
-    folder = shards or Path(trained.config.data.shards)
-    there = folder.is_dir()
-    if shards is None and not there and use is None:
-        raise InputError(
-            f"{run} was trained on shards '{folder}', which do not exist; name the shards to "
-            "compare with: --shards."
-        )
+    known = shards or Path(trained.config.data.shards)
+    if shards is None and not known.is_dir():
+        if use is None:
+            raise InputError(
+                f"{run} was trained on shards '{known}', which do not exist; name the shards to "
+                "compare with: --shards."
+            )
+        known = None
 
-    def make() -> list[Scene]:
+    def generate() -> list[Scene]:
         if asked:
             from sceneprior.apps.api import load
 
             return load(run).sample(count, options.seed, distribution, **asked)
         return sample_rooms(trained, count, options.seed, distribution)
 
-    if use is not None and (use.alone or not (there or shards)):
-        generated = make()
-        known = there and not known_from_views_alone(folder, options.split)
-        scores = evaluate_use(generated, options, use, folder if known else None)
-    elif known_from_views_alone(folder, options.split):
-        masks: dict[str, float] = {}
-        if isinstance(trained, TrainedPrior) and trained.remembers_rooms:
-            masks = mask_scores(trained, folder)
-        generated = make()
-        scores = evaluate_from_views(generated, folder, options) | masks
-        if use is not None:
-            scores = evaluate_use(generated, options, use, scores=scores)
-    else:
-        # This comes first, because it refuses shards that are not the run's.
-        pairs = decoded_and_true(trained, folder) if trained.remembers_rooms else []
-        generated = make()
-        scores = evaluate_synthesis(generated, folder, options, [decoded for decoded, _ in pairs])
-        if pairs:
-            scores |= reconstruction_scores(pairs)
-        if use is not None:
-            scores = evaluate_use(generated, options, use, folder, scores)
-    scores["protocol"] |= {"run": Path(run).name, "stage": trained.stage}
-    with_latents = isinstance(trained, TrainedPrior)
-    latents = marked(distribution or trained.distribution) if with_latents else "its own"
-    scores["protocol"]["latents"] = latents
+    scores = _scores(generate, known, options, use, trained)
+    latents = "its own"
+    if isinstance(trained, TrainedPrior):
+        latents = marked(distribution or trained.distribution)
+    scores["protocol"] |= {"run": Path(run).name, "stage": trained.stage, "latents": latents}
     write_json(out, scores)
     return scores
 
@@ -120,18 +99,43 @@ def evaluate_folder(
             "to take all of them, or make more."
         )
     rows = seeded_rows(len(scenes), count or len(scenes), options.seed)
-    chosen = [scenes[row] for row in rows]
-    scores, real = None, None
-    if shards is not None:
-        alone = known_from_views_alone(shards, options.split)
-        real = None if alone else shards
-        if use is None or not use.alone:
-            scores = (evaluate_from_views if alone else evaluate_synthesis)(chosen, shards, options)
-    if use is not None:
-        scores = evaluate_use(chosen, options, use, real, scores)
-    assert scores is not None  # without `use`, there are shards
+    scores = _scores(lambda: [scenes[row] for row in rows], shards, options, use)
     scores["protocol"] |= {"scenes": folder.resolve().name, "n_scenes_available": len(scenes)}
     write_json(out, scores)
+    return scores
+
+
+def _scores(
+    generate: Callable[[], list[Scene]],
+    shards: Path | None,
+    options: EvalOptions,
+    use: UseOptions | None,
+    trained: Trained | None = None,
+) -> dict[str, Any]:
+    """Scores of rooms against the test rooms of shards, and their metrics of use.
+
+    If a run keeps the latents of its training rooms, these rooms are decoded and scored as well:
+    against their 3D ground truth or, if the shards have none, against the observed masks. This
+    comes first, because it refuses shards that are not the run's.
+    """
+    in_3d = shards is not None and not known_from_views_alone(shards, options.split)
+    keeping = trained if isinstance(trained, TrainedPrior) and trained.remembers_rooms else None
+    scores: dict[str, Any] | None = None
+    if shards is None or (use is not None and use.alone):
+        generated = generate()
+    elif in_3d:
+        pairs = [] if keeping is None else decoded_and_true(keeping, shards)
+        generated = generate()
+        scores = evaluate_synthesis(generated, shards, options, [decoded for decoded, _ in pairs])
+        if pairs:
+            scores |= reconstruction_scores(pairs)
+    else:
+        masks = {} if keeping is None else mask_scores(keeping, shards)
+        generated = generate()
+        scores = evaluate_from_views(generated, shards, options) | masks
+    if use is not None:
+        scores = evaluate_use(generated, options, use, shards if in_3d else None, scores)
+    assert scores is not None  # without `use`, there are shards
     return scores
 
 
@@ -157,11 +161,7 @@ def decoded_and_true(
 
 
 def report_run(
-    run: Path,
-    scores: Path | None,
-    out: Path,
-    seed: int,
-    commands: tuple[str, ...],
+    run: Path, scores: Path | None, out: Path, seed: int, commands: tuple[str, ...]
 ) -> None:
     """Write the report page of a run, without comparisons if the rooms have no 3D ground truth."""
     trained = load_any_run(run)
@@ -194,11 +194,7 @@ def report_run(
 
 
 def report_folder(
-    folder: Path,
-    shards: Path,
-    scores: Path | None,
-    out: Path,
-    commands: tuple[str, ...],
+    folder: Path, shards: Path, scores: Path | None, out: Path, commands: tuple[str, ...]
 ) -> None:
     """Write the report page of the user's scenes, made by any method, without the parts that need
     a run."""

@@ -1,15 +1,16 @@
-"""CAD models by class, from the files of a folder, with points on their surfaces.
+"""CAD models by class, with points on their surfaces: of a folder's files, or the package's own.
 
-Points are sampled once per model and cached in one file; they are sampled again when the model's
-file changes.
+Points of files are sampled once per model and cached in one file; they are sampled again when the
+model's file changes. The package's own furniture (`sceneprior/furniture`) is built when an object
+first needs its class, in 10 to 100 ms.
 """
 
 import hashlib
 import io
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -21,11 +22,12 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.files import file_stamp, write_whole
 from sceneprior.core.geometry.surfaces import surface_points
 from sceneprior.core.scene import Mesh, Textured
+from sceneprior.furniture.catalog import Model, furniture_classes, make_variants
 
 POINTS = 1024
 """Points per surface; on a surface of 2 m2, one every 4 to 5 cm."""
 SEED = 0
-FORMAT = 1
+FORMAT = 2
 """Version of the cache file; increase it when the sampling of points changes."""
 _FLAT = 1e-9
 """Ratio to the longest side up to which a side counts as flat; flat sides are not scaled."""
@@ -123,55 +125,102 @@ def unit_points(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
 
 
 def _points_of_models(
-    folder: Path, found: ModelFiles, cache: Path, count: int, track: Track
+    folder: Path, found: ModelFiles, cached: Path, count: int, track: Track
 ) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Sample `count` points of each model; returns them, and the reasons for broken models.
 
-    The points are cached in an npz in the folder `cache`, even if sampling is interrupted.
+    The points are cached in an npz in the folder `cached`, even if sampling is interrupted.
     """
     settings = f"{folder.resolve()}|{count}|{SEED}|{FORMAT}"
-    kept = cache / f"points-{hashlib.sha256(settings.encode()).hexdigest()[:16]}.npz"
-    points, stamps = _read_points(kept, count)
-    before, todo, broken = dict(stamps), dict[str, tuple[int, int]](), dict[str, str]()
+    kept = cached / f"points-{hashlib.sha256(settings.encode()).hexdigest()[:16]}.npz"
+    before = _read_points(kept)
+    keys, broken = dict[str, str](), dict[str, str]()
     for model_id, path in found.paths.items():
         try:
-            stamp = file_stamp(path)
-            if stamps.get(model_id) != stamp:
-                todo[model_id] = stamp
+            keys[model_id] = f"{model_id} {file_stamp(path)}"
         except InputError as error:
             broken[model_id] = str(error)
+    points = {key: before[key] for key in keys.values() if key in before}
     try:
-        for model_id in track(list(todo)):
+        for model_id in track([m for m, key in keys.items() if key not in points]):
             try:
                 mesh = found.read(found.paths[model_id])
-                vertices = np.asarray(mesh.vertices_m, dtype=np.float64)
-                # Points are sampled before scaling to the unit box, which would enlarge thin sides.
-                drawn = surface_points(vertices, mesh.faces, count, SEED)
-                points[model_id] = unit_points(drawn, vertices).astype(np.float32)
-                stamps[model_id] = todo[model_id]
+                points[keys[model_id]] = _unit_samples(mesh.vertices_m, mesh.faces, count)
             except (InputError, ValueError) as error:
                 broken[model_id] = str(error)
     finally:
-        if stamps != before:
-            ids, buffer = sorted(stamps), io.BytesIO()
-            np.savez(
-                buffer,
-                ids=np.array(ids),
-                stamps=np.array([stamps[m] for m in ids], np.int64),
-                points=np.stack([points[m] for m in ids]),
-            )
+        if points.keys() - before.keys():
+            buffer = io.BytesIO()
+            np.savez(buffer, keys=np.array(list(points)), points=np.stack(list(points.values())))
             write_whole(kept, buffer.getvalue())
-    return points, broken
+    return {m: points[key] for m, key in keys.items() if key in points}, broken
 
 
-def _read_points(
-    path: Path, count: int
-) -> tuple[dict[str, np.ndarray], dict[str, tuple[int, int]]]:
+def _read_points(path: Path) -> dict[str, np.ndarray]:
     try:
         with np.load(path, allow_pickle=False) as file:
-            ids, stamps, points = file["ids"].tolist(), file["stamps"].tolist(), file["points"]
+            return dict(zip(file["keys"].tolist(), file["points"], strict=True))
     except Exception:  # absent or damaged: points are sampled again
-        return {}, {}
-    if points.shape != (len(ids), count, 3):
-        return {}, {}
-    return dict(zip(ids, points, strict=True)), dict(zip(ids, map(tuple, stamps), strict=True))
+        return {}
+
+
+def _unit_samples(
+    vertices: np.ndarray, faces: np.ndarray, count: int
+) -> Float[np.ndarray, "{count} 3"]:
+    """Points on a surface, moved and scaled with it to the unit box.
+
+    They are sampled before scaling, which would enlarge thin sides.
+    """
+    vertices = np.asarray(vertices, dtype=np.float64)
+    points = surface_points(vertices, faces, count, SEED)
+    return unit_points(points, vertices).astype(np.float32)
+
+
+# -- The package's own models ----------------------------------------------------------------------
+
+
+@cache
+def made_models() -> CadModels:
+    """The package's own models of all classes that have tables of parts.
+
+    A class has the models of `make_variants`, in its styles and in sizes of real furniture. Their
+    meshes are unions of closed solids.
+    """
+    return CadModels(_Made(), _load)
+
+
+class _Made(Mapping[str, ClassModels]):
+    """Models by class, each class built when it is first read."""
+
+    def __getitem__(self, label: str) -> ClassModels:
+        if label not in furniture_classes():
+            raise KeyError(label)
+        return _made_of(label)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(furniture_classes())
+
+    def __len__(self) -> int:
+        return len(furniture_classes())
+
+
+@cache
+def _made_of(label: str) -> ClassModels:
+    points = [_unit_samples(*_arrays(model), POINTS) for model in _variants(label)]
+    ids = tuple(f"{label}_{row:02d}" for row in range(len(points)))
+    return ClassModels(ids, np.stack(points))
+
+
+@cache
+def _load(model_id: str) -> Mesh:
+    label, _, row = model_id.rpartition("_")
+    return unit_mesh(Mesh(*_arrays(_variants(label)[int(row)])))
+
+
+@cache
+def _variants(label: str) -> list[Model]:
+    return make_variants(SEED, label)
+
+
+def _arrays(model: Model) -> tuple[np.ndarray, np.ndarray]:
+    return np.asarray(model.mesh.vertices), np.asarray(model.mesh.faces)

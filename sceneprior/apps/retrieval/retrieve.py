@@ -20,7 +20,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from sceneprior.apps.retrieval.cad_models import CadModels, ClassModels
+from sceneprior.apps.retrieval.cad_models import CadModels, ClassModels, made_models
 from sceneprior.core.geometry.surfaces import chamfer_mean, surface_points
 from sceneprior.core.geometry.turns import QUARTERS, quarter_rotation
 from sceneprior.core.scene import Mesh, Scene, SceneObject, quarter_turned
@@ -91,6 +91,17 @@ def retrieve_all(
     # One thread per core, each with one torch thread, since the matrix products are small.
     with ThreadPoolExecutor(os.cpu_count(), initializer=torch.set_num_threads, initargs=(1,)) as p:
         yield from p.map(lambda scene: retrieve(scene, models, keep), scenes)
+
+
+def with_models(scenes: Sequence[Scene], given: Sequence[SceneObject] = ()) -> list[Scene]:
+    """Scenes with the package's own models in place of their meshes (`retrieve`).
+
+    Args:
+        given: Objects given by the user, which come first in every scene; those with a mesh keep
+            it.
+    """
+    keep = [row for row, item in enumerate(given) if item.mesh is not None]
+    return list(retrieve_all(scenes, made_models(), keep))
 
 
 def retrieval_report(scenes: Sequence[Scene], models: CadModels) -> dict[str, Any]:

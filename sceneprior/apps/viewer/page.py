@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from sceneprior.apps.retrieval.cad_models import CadModels
-from sceneprior.apps.retrieval.made_models import made_models
+from sceneprior.apps.retrieval.cad_models import CadModels, made_models
 from sceneprior.apps.retrieval.retrieve import retrieve
 from sceneprior.apps.viewer.board import Board, BoardPlane, Point
 from sceneprior.apps.viewer.explorer import NOTHING_ASKED, Explorer, Folder, Shown, floor_side_m

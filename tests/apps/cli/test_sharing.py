@@ -10,7 +10,7 @@ from cli_helpers import one_sentence
 from toy_metrics import without_classifiers
 
 from sceneprior.apps.config import load_any_run
-from sceneprior.apps.priors.where import shipped_priors
+from sceneprior.apps.priors.packed import shipped_priors
 from sceneprior.apps.rooms import write_scenes
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.interchange.export import FORMATS

@@ -9,8 +9,7 @@ from golden_values import assert_as_before
 from tiny_runs import tiny_config
 
 from sceneprior.apps.config import load_any_run
-from sceneprior.apps.priors.packed import FILES, pack, read_packed, write_packed
-from sceneprior.apps.priors.where import shipped_priors
+from sceneprior.apps.priors.packed import FILES, pack, read_packed, shipped_priors, write_packed
 
 
 def digest(content: bytes) -> str:

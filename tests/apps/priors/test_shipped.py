@@ -8,8 +8,7 @@ import pytest
 import torch
 
 import sceneprior
-from sceneprior.apps.priors.packed import FILES, read_packed
-from sceneprior.apps.priors.where import shipped_priors
+from sceneprior.apps.priors.packed import FILES, read_packed, shipped_priors
 from sceneprior.core.errors import InputError
 from sceneprior.render.scene_files import save
 

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from sceneprior.apps.config import load_any_run
-from sceneprior.apps.priors.packed import FILES, pack, write_packed
-from sceneprior.apps.priors.where import find_prior, shipped_priors
+from sceneprior.apps.priors.packed import FILES, find_prior, pack, shipped_priors, write_packed
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.errors import InputError
 

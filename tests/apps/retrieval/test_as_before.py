@@ -6,8 +6,7 @@ import trimesh
 from golden_values import assert_as_before
 from model_folder import blocks, corner_sofa, write_models
 
-from sceneprior.apps.retrieval.cad_models import open_models
-from sceneprior.apps.retrieval.made_models import made_models
+from sceneprior.apps.retrieval.cad_models import made_models, open_models
 from sceneprior.apps.retrieval.retrieve import retrieval_report, retrieve, retrieve_all
 from sceneprior.core.geometry.turns import quarter_rotation
 from sceneprior.core.scene import Mesh, Scene, SceneObject, quarter_turned

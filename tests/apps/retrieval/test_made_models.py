@@ -7,9 +7,9 @@ import pytest
 import trimesh
 
 import sceneprior
-from sceneprior.apps.priors.packed import read_packed
-from sceneprior.apps.priors.where import shipped_priors
-from sceneprior.apps.retrieval.made_models import made_models, with_models
+from sceneprior.apps.priors.packed import read_packed, shipped_priors
+from sceneprior.apps.retrieval.cad_models import made_models
+from sceneprior.apps.retrieval.retrieve import with_models
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.core.scene_json import scene_to_json
 from sceneprior.furniture.catalog import furniture_classes, make_variants
