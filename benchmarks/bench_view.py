@@ -51,7 +51,7 @@ def main() -> None:
     torch.set_num_threads(1)  # as in `sceneprior view`
     explorer = Explorer(load(given.run))
     with serving("127.0.0.1", 0) as server:
-        page = Page(server, explorer, Path(given.run).name)
+        page = Page(server, explorer)
         assert explorer.map is not None, "the run has training rooms"
         middle, side = explorer.map.middle, RADIUS * explorer.map.side
         points = [
@@ -92,7 +92,7 @@ def dragged(page: Page, points: list[tuple[float, float]]) -> dict[str, float]:
         "near": 0.01, "far": 1000.0, "image_height": 720, "image_width": 960,
         "look_at": (0.0, 0.0, 0.0), "up_direction": (0.0, 1.0, 0.0),
     }  # fmt: skip
-    target = page.board.plane.in_scene(torch.tensor(points)).tolist()
+    target = page.board.in_scene(page.board.on_board(torch.tensor(points))).tolist()
     came: list[tuple[float, str, int]] = []
     protocol = Subprotocol(f"viser-v{viser.__version__}")
     url = f"ws://127.0.0.1:{page.server.get_port()}"

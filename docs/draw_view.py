@@ -14,7 +14,7 @@ from PIL import Image
 
 import sceneprior
 from sceneprior.apps.viewer.explorer import Explorer
-from sceneprior.apps.viewer.page import Page
+from sceneprior.apps.viewer.panel import open_page
 from sceneprior.apps.viewer.server import serving
 
 ASKED = {
@@ -45,7 +45,7 @@ def main() -> None:
     driver = webdriver.Chrome(chrome, Service(shutil.which("chromedriver")))
     try:
         with serving("127.0.0.1", 0) as server:
-            Page(server, Explorer(sceneprior.load(given.prior)), given.prior, asked=ASKED)
+            open_page(server, Explorer(sceneprior.load(given.prior)), given.prior, asked=ASKED)
             driver.set_window_size(WIDTH_PX, HEIGHT_PX)
             driver.get(f"http://127.0.0.1:{server.get_port()}")
             time.sleep(SETTLED_S)

@@ -58,7 +58,7 @@ def view(
     from sceneprior.apps.requests import with_floor_of_file
     from sceneprior.apps.retrieval.cad_models import open_models
     from sceneprior.apps.viewer.explorer import Explorer, Folder
-    from sceneprior.apps.viewer.page import Page
+    from sceneprior.apps.viewer.panel import open_page
     from sceneprior.render.scene_files import load_scene_folder
 
     # One room at a time is too little work for several threads.
@@ -73,7 +73,7 @@ def view(
         source = Folder(load_scene_folder(folder)) if is_folder else Explorer(load(where))
         bank = None if models is None else open_models(models, source.label_set, cache)
         with serving(host, port) as server:
-            Page(server, source, folder.name, bank, with_floor_of_file(asked), drawn)
+            open_page(server, source, folder.name, bank, with_floor_of_file(asked), drawn)
             typer.echo(f"Open http://localhost:{port} in a browser. Ctrl-C ends it.")
             if isinstance(source, Explorer):
                 threading.Thread(target=source.find_meshes, args=(stop,)).start()

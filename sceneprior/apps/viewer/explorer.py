@@ -1,4 +1,4 @@
-"""The viewer's logic, without the page: rooms of a prior or of a folder."""
+"""The viewer's rooms, without a page: those of a trained prior, or of a folder of scenes."""
 
 import threading
 from collections.abc import Mapping, Sequence
@@ -27,12 +27,8 @@ from sceneprior.paper.sampling import DISTRIBUTIONS, named_latent
 
 PATH_STEPS = 49
 """Number of rooms of a path with both ends; neighbours are rarely more than 4 degrees apart."""
-SOME = 64
-"""Largest number of training rooms for estimating room sizes; decoding all would take a second."""
 HERE = "here"
 """Text that names the shown room as an end of a path."""
-
-
 NOTHING_ASKED: Mapping[str, Any] = MappingProxyType({})
 
 
@@ -67,8 +63,8 @@ class Folder:
         """The label set of all scenes; several are an InputError."""
         return common_label_set(self.scenes)
 
-    def some_layouts(self) -> tuple[Scene, ...]:
-        """The scenes from which the size of rooms is estimated: all scenes of the folder."""
+    def layouts(self) -> Sequence[Scene]:
+        """Rooms from which the size of rooms is estimated: all of the folder."""
         return self.scenes
 
     def room(self, row: int) -> Shown:
@@ -94,7 +90,7 @@ class Explorer:
 
     @property
     def has_latents(self) -> bool:
-        """True if rooms are decoded from latents, as paths and completion need."""
+        """True if rooms are decoded from latents, as paths need."""
         return isinstance(self.prior.trained, TrainedPrior)
 
     @cached_property
@@ -116,7 +112,7 @@ class Explorer:
 
     @property
     def takes_requests(self) -> bool:
-        """True if a sampler draws rooms, as requests need."""
+        """True if a sampler draws rooms, as requests and completion need."""
         return SAMPLER in self.distributions
 
     def sample(
@@ -142,6 +138,15 @@ class Explorer:
         scene = self.prior.sample(1, seed, distribution, **asked)[0]
         return Shown(scene, f"seed {seed}, from: {origin}{', as requested' if asked else ''}")
 
+    def complete(self, shown: Shown, seed: int, want: str = "") -> Shown:
+        """Complete the room around the kept objects, with wishes if there are any.
+
+        The shown room's floor, doors, windows and ceiling also stay.
+        """
+        room = self.prior.complete(shown.given(), 1, seed, want=want or None)[0]
+        kept = frozenset(range(len(shown.kept)))
+        return Shown(room, f"completed around {len(kept)} kept objects, seed {seed}", kept)
+
     def training_room(self, row: int) -> Shown:
         """A training room as the prior decodes it."""
         room_id = self.prior.trained.room_ids[row]
@@ -160,6 +165,10 @@ class Explorer:
         z = self.map.moved(start, point)
         x, y = self.map.place(z.unsqueeze(0))[0].tolist()
         return self._decoded(z, "from_the_map", f"map {x:+.3f}, {y:+.3f}")
+
+    def _decoded(self, z: Float[Tensor, " dimension"], name: str, origin: str) -> Shown:
+        rooms = decode_latents(self.prior.with_latents, z.unsqueeze(0), [name])
+        return Shown(rooms[0], origin)
 
     def draw_path(self, shown: Shown, start: str, end: str) -> Float[Tensor, "steps dimension"]:
         """Set the path of `step`, and return its latents from start to end.
@@ -185,40 +194,26 @@ class Explorer:
         (room,) = self.path.rooms(place, [f"step_{number:02d}"])
         return Shown(room.scene, f"path, step {number} of {PATH_STEPS - 1}")
 
-    def complete(self, shown: Shown, seed: int, want: str = "") -> Shown:
-        """Complete the room around the kept objects, with wishes if there are any.
-
-        The shown room's floor, doors, windows and ceiling also stay.
-        """
-        room = self.prior.complete(shown.given(), 1, seed, want=want or None)[0]
-        kept = frozenset(range(len(shown.kept)))
-        return Shown(room, f"completed around {len(kept)} kept objects, seed {seed}", kept)
-
     def nearest(self, scene: Scene) -> tuple[Shown, float]:
         """The decoded training room with the nearest layout, and its `layout_distance` (metres)."""
-        row, distance_m = nearest_room(scene, self._layouts)
+        row, distance_m = nearest_room(scene, self._training_layouts)
         return self.training_room(row), distance_m
 
-    @cached_property
-    def _layouts(self) -> list[Scene]:
-        return self._boxes_of(range(len(self._training_z)))
+    def layouts(self) -> Sequence[Scene]:
+        """Rooms from which the size of rooms is estimated: training rooms, or a few new ones."""
+        if self.map is not None:
+            return self._training_layouts
+        return self.prior.sample(16, 0, next(iter(self.distributions), None))
 
-    def _boxes_of(self, rows: Sequence[int]) -> list[Scene]:
-        """Training rooms as the prior decodes them, without shapes."""
+    @cached_property
+    def _training_layouts(self) -> list[Scene]:
+        """Training rooms as the prior decodes them, without shapes; a second for 500 rooms."""
         trained = self.prior.with_latents
         with torch.no_grad():
-            decoded = trained.prior.decode(self._training_z[list(rows)], with_shape=False)
-        names = [trained.room_ids[row] for row in rows]
+            decoded = trained.prior.decode(self._training_z, with_shape=False)
         target = trained.config.model.completeness_target
-        rooms = to_rooms(decoded, trained.prior, self.label_set, names, target)
+        rooms = to_rooms(decoded, trained.prior, self.label_set, trained.room_ids, target)
         return [room.scene for room in rooms]
-
-    def some_layouts(self) -> list[Scene]:
-        """Rooms without shapes, from which the size of rooms is estimated."""
-        if self.map is not None:
-            most = len(self._training_z)
-            return self._boxes_of(range(0, most, -(-most // SOME)))
-        return self.prior.sample(16, 0, next(iter(self.distributions), None))
 
     def find_meshes(self, stop: threading.Event) -> None:
         """Extract the meshes of all shape prototypes in advance, so that no room has to wait."""
@@ -228,10 +223,6 @@ class Explorer:
                 if stop.is_set():
                     return
                 trained.prior.shape.surface(prototype)
-
-    def _decoded(self, z: Float[Tensor, " dimension"], name: str, origin: str) -> Shown:
-        rooms = decode_latents(self.prior.with_latents, z.unsqueeze(0), [name])
-        return Shown(rooms[0], origin)
 
 
 def floor_side_m(scenes: Sequence[Scene]) -> float:

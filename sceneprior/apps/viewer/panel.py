@@ -1,81 +1,123 @@
 """The page's control panel: new rooms, requests, paths, completion, display and downloads."""
 
+import io
+import zipfile
 from collections.abc import Callable, Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from sceneprior.apps.viewer.asking import RequestFields
-from sceneprior.apps.viewer.downloads import FORMATS, download
-from sceneprior.apps.viewer.explorer import HERE, PATH_STEPS, Explorer, Folder, Shown
-from sceneprior.apps.viewer.words import error_words, html, room_words, wish_words
+import numpy as np
+
+from sceneprior.apps.retrieval.cad_models import CadModels
+from sceneprior.apps.viewer.explorer import HERE, NOTHING_ASKED, PATH_STEPS, Explorer, Folder
+from sceneprior.apps.viewer.page import Page
+from sceneprior.apps.viewer.panel_html import error_html, html, room_html, wishes_html
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene
 from sceneprior.core.shell import SHELLS, ShellName
+from sceneprior.interchange.export import SIMULATORS, export_scenes
+from sceneprior.lifted.requests.openings import read_openings
+from sceneprior.lifted.requests.shape import read_floor
+from sceneprior.render.scene_files import check_names, save
 
 if TYPE_CHECKING:
-    from sceneprior.apps.viewer.page import Page
+    import viser
 
 FURNITURE = DECODED, MODELS = "decoded", "models"
 """The choices of `Furniture`: the meshes of the prior or the scene files, or CAD models."""
+FORMATS = {
+    "GLB": ".glb", "JSON": ".json", "OBJ": "obj", "USD": "usd", "MuJoCo (MJCF)": "mujoco",
+    "Habitat": "habitat", "SceneEval": "sceneeval", "ATISS": "atiss", "3D-FRONT": "threed-front",
+}  # fmt: skip
+"""Formats of downloads: endings for `save`, or formats of `export_scenes`."""
+_FIELDS = {
+    "floor": ("Floor", "4x3 (metres), or corners: 0,0 5,0 5,3 2,3 2,5 0,5. Empty: any floor."),
+    "openings": ("Doors", "door, window@north, door@0:1.5 (1.5 m along the wall from corner 0)"),
+    "want": ("Wishes", "a double bed and two nightstands beside it; or nightstand: 2, desk: 0"),
+    "ceiling_m": ("Ceiling", "Height in metres"),
+}
+"""Name and hint of each text field of a request."""
+
+
+def open_page(
+    server: "viser.ViserServer",
+    source: Explorer | Folder,
+    title: str,
+    models: CadModels | None = None,
+    asked: Mapping[str, Any] = NOTHING_ASKED,
+    shell: ShellName = "walls",
+) -> "Panel":
+    """A page with its panel; see `Page` for the arguments."""
+    server.gui.configure_theme(show_logo=False, show_share_button=False)
+    server.gui.set_panel_label(title)
+    server.gui.main_panel.dock_right()
+    return Panel(Page(server, source, models, asked, shell), asked)
 
 
 class Panel:
-    """The control panel of a page, with the descriptions of the shown room and its wishes."""
+    """The controls of a page, with descriptions of the shown room and its wishes."""
 
-    def __init__(self, page: "Page", asked: Mapping[str, Any], shell: ShellName):
-        self._page, self._gui = page, page.server.gui
-        self._said = self._gui.add_html("")
-        self._answer: Any = None
-        self._fields: RequestFields | None = None
+    def __init__(self, page: Page, asked: Mapping[str, Any] = NOTHING_ASKED):
+        self.page, self._gui = page, page.server.gui
+        self._room_text = self._gui.add_html("")
+        self._wishes_text: Any = None
+        self._nearest_text: Any = None
+        self.request: RequestFields | None = None
         source = page.source
         if isinstance(source, Folder):
             self._add_folder(source)
         else:
             self._add_sampling(source, asked)
-        self._add_show(shell)
+        self._add_show()
         self._add_download()
         if isinstance(source, Explorer):
-            if source.has_latents:
-                self._add_completion(source)
             self._add_map(source)
             if source.has_latents:
                 self._add_path(source)
+        page.on_show = self._describe
+        self._describe()
 
-    def describe(self, shown: Shown, scene: Scene) -> None:
-        """Describe the shown room and its wishes."""
-        self._said.content = html(room_words(shown, scene))
-        if self._answer is not None:
-            self._answer.content = html(wish_words(scene))
-
-    def describe_nearest(self, room: Shown | None, distance_m: float) -> None:
-        """Describe the nearest training room; None if it is not shown."""
-        told = "" if room is None else f"Right: {room.origin}; {distance_m:.2f} m away in layout."
-        self._nearest_said.content = html(told) if told else ""
+    def _describe(self) -> None:
+        """Describe the shown room, its wishes, and the nearest training room."""
+        page = self.page
+        self._room_text.content = html(room_html(page.shown, page.scene))
+        if self._wishes_text is not None:
+            self._wishes_text.content = html(wishes_html(page.scene))
+        if self._nearest_text is not None:
+            self._nearest_text.content = ""
+            if page.nearest is not None:
+                room, distance_m = page.nearest
+                text = f"Right: {room.origin}; {distance_m:.2f} m away in layout."
+                self._nearest_text.content = html(text)
 
     def _add_folder(self, folder: Folder) -> None:
-        names = [scene.name for scene in folder.scenes]
-        self._answer = self._gui.add_html("")
-        if len(names) < 2:
+        count = len(folder.scenes)
+        self._wishes_text = self._gui.add_html("")
+        if count < 2:
             return
-        page = self._page
-        number: Any = self._gui.add_slider("Room", min=1, max=len(names), step=1, initial_value=1)
+        page = self.page
+        number: Any = self._gui.add_slider("Room", min=1, max=count, step=1, initial_value=1)
         number.on_update(lambda _: page.follow(lambda: page.show(folder.room(number.value - 1))))
 
         def turn(by: int) -> None:
-            number.value = 1 + (number.value - 1 + by) % len(names)
+            number.value = 1 + (number.value - 1 + by) % count
 
         self._buttons({"Previous": lambda: turn(-1), "Next": lambda: turn(1)})
 
     def _add_sampling(self, explorer: Explorer, asked: Mapping[str, Any]) -> None:
-        gui, page = self._gui, self._page
+        gui, page = self._gui, self.page
         with gui.add_folder("New room"):
             known = explorer.distributions
             if explorer.takes_requests:
-                self._fields = RequestFields(page.server, asked, page.safely)
+                self.request = RequestFields(gui, asked)
+                clear = gui.add_button("Clear the request", color="gray")
+                clear.on_click(lambda _: page.safely(self.request.clear))
             origin = gui.add_dropdown("From", known, initial_value=known[0]) if known else None
             seed: Any = gui.add_number("Seed", 0, min=0, step=1)
 
             def sample() -> None:
-                self._sample(explorer, seed.value, None if origin is None else origin.value)
+                self.sample(explorer, seed.value, None if origin is None else origin.value)
 
             def another() -> None:
                 seed.value += 1  # the update triggers `sample`
@@ -85,19 +127,31 @@ class Panel:
                     each.on_update(lambda _: page.safely(sample))
             gui.add_button("Make room").on_click(lambda _: page.safely(sample))
             gui.add_button("Next seed").on_click(lambda _: page.safely(another))
-            self._answer = gui.add_html("")
+            if (request := self.request) is not None:
+                again: Any = gui.add_number("Seed ", 0, min=0, step=1)
+                complete = gui.add_button(
+                    "Complete the rest",
+                    hint="Click objects to keep them; all others are replaced by new ones",
+                )
 
-    def _sample(self, explorer: Explorer, seed: int, distribution: str | None) -> None:
+                def completed() -> None:
+                    page.show(explorer.complete(page.shown, again.value, request.text("want")))
+                    again.value += 1
+
+                complete.on_click(lambda _: page.safely(completed))
+            self._wishes_text = gui.add_html("")
+
+    def sample(self, explorer: Explorer, seed: int, distribution: str | None) -> None:
         """Show a new room, or the reason why the request cannot be met."""
         try:
-            asked = {} if self._fields is None else self._fields.asked()
+            asked = {} if self.request is None else self.request.asked()
             if asked:
-                self._answer.content = html("Looking for a room ...")
+                self._wishes_text.content = html("Looking for a room ...")
             shown = explorer.sample(seed, distribution, asked)
         except InputError as error:
-            self._answer.content = html(error_words(str(error)))
+            self._wishes_text.content = html(error_html(str(error)))
             raise
-        self._page.show(shown)
+        self.page.show(shown)
 
     def _add_map(self, explorer: Explorer) -> None:
         if explorer.map is None:
@@ -110,7 +164,7 @@ class Panel:
         )
 
     def _add_path(self, explorer: Explorer) -> None:
-        gui, page = self._gui, self._page
+        gui, page = self._gui, self.page
         with gui.add_folder("Path", expand_by_default=False):
             hint = f"A training room's id, {HERE}, or paper:7 (New room's seed 7 from paper)"
             start = gui.add_text("From", "paper:1", hint=hint)
@@ -135,61 +189,155 @@ class Panel:
             step.on_update(lambda _: page.follow(walk))
             self._buttons({"Draw path": draw})
 
-    def _add_completion(self, explorer: Explorer) -> None:
-        gui, page = self._gui, self._page
-        with gui.add_folder("Complete"):
-            told = " The wishes above hold for the whole room." if explorer.takes_requests else ""
-            gui.add_markdown(
-                f"Click objects to keep them; all others are replaced by new ones.{told}"
-            )
-            seed: Any = gui.add_number("Seed ", 0, min=0, step=1)
-
-            def complete() -> None:
-                want = "" if self._fields is None else self._fields.want.value.strip()
-                page.show(explorer.complete(page.shown, seed.value, want))
-                seed.value += 1
-
-            self._buttons({"Complete the rest": complete})
-
-    def _add_show(self, shell: ShellName) -> None:
-        gui, page = self._gui, self._page
+    def _add_show(self) -> None:
+        gui, page = self._gui, self.page
         with gui.add_folder("Show"):
-            self.shell: Any = gui.add_dropdown(
-                "Shell", SHELLS, initial_value=shell,
-                hint="Floor and walls, the floor, or neither; in downloads, too",
+            self.shell = self._choice(
+                "shell", gui.add_dropdown(
+                    "Shell", SHELLS, initial_value=page.display.shell,
+                    hint="Floor and walls, the floor, or neither; in downloads, too",
+                ),
             )  # fmt: skip
-            self.shell.on_update(lambda _: page.safely(lambda: page.show(page.shown)))
-            self.names = self._box("Names and sizes", False)
-            self.boxes = self._box("Boxes", False)
-            self.furniture: Any = gui.add_dropdown("Furniture", FURNITURE, initial_value=DECODED)
-            self.furniture.on_update(lambda _: page.safely(lambda: page.show(page.shown)))
-            self.nearest: Any = None
+            self.names = self._choice("names", gui.add_checkbox("Names and sizes", False))
+            self._choice("boxes", gui.add_checkbox("Boxes", False))
+            self.furniture = self._choice(
+                "models", gui.add_dropdown("Furniture", FURNITURE, initial_value=DECODED),
+                lambda value: value == MODELS,
+            )  # fmt: skip
             if page.board is not None:
-                self.nearest = self._box("Nearest training room", False)
-                self._nearest_said = gui.add_html("")
+                self._choice("nearest", gui.add_checkbox("Nearest training room", False))
+                self._nearest_text = gui.add_html("")
             self._buttons({"Whole room in view": lambda: page.frame(True)})
 
-    def _box(self, name: str, value: bool) -> Any:
-        page = self._page
-        box = self._gui.add_checkbox(name, value)
-        box.on_update(lambda _: page.safely(lambda: page.show(page.shown)))
-        return box
+    def _choice(
+        self, name: str, control: Any, convert: Callable[[Any], Any] = lambda value: value
+    ) -> Any:
+        """Let a control choose the value `name` of the page's display."""
+        page = self.page
+
+        def chosen() -> None:
+            setattr(page.display, name, convert(control.value))
+            page.show(page.shown)
+
+        control.on_update(lambda _: page.safely(chosen))
+        return control
 
     def _add_download(self) -> None:
         with self._gui.add_folder("Download"):
-            form: Any = self._gui.add_dropdown("Format", FORMATS)
+            form: Any = self._gui.add_dropdown("Format", tuple(FORMATS))
             button = self._gui.add_button("Download")
-            button.on_click(
-                lambda event: self._page.safely(lambda: self._send(form.value, event.client))
-            )
 
-    def _send(self, form: str, client: Any) -> None:
-        """Send the displayed room to the browser that asked for it."""
-        name, content, notes = download(self._page.scene, form, self.shell.value)
-        client.send_file_download(name, content, save_immediately=True)
-        if notes:
-            client.add_notification("Note", " ".join(notes), auto_close_seconds=20)
+            def send(client: Any) -> None:
+                name, content, notes = download(
+                    self.page.scene, form.value, self.page.display.shell
+                )
+                client.send_file_download(name, content, save_immediately=True)
+                if notes:
+                    client.add_notification("Note", " ".join(notes), auto_close_seconds=20)
+
+            button.on_click(lambda event: self.page.safely(lambda: send(event.client)))
 
     def _buttons(self, tasks: dict[str, Callable[[], None]]) -> None:
         group = self._gui.add_button_group("", tuple(tasks))
-        group.on_click(lambda _: self._page.safely(tasks[group.value]))
+        group.on_click(lambda _: self.page.safely(tasks[group.value]))
+
+
+class RequestFields:
+    """Text fields of a request.
+
+    Args:
+        asked: The initial request; parts without a text field stay in every request until `clear`.
+    """
+
+    def __init__(self, gui: Any, asked: Mapping[str, Any]):
+        texts, self._rest = _texts_of(asked)
+        self.fields: dict[str, Any] = {
+            key: gui.add_text(label, texts[key], multiline=key == "want", hint=hint)
+            for key, (label, hint) in _FIELDS.items()
+        }
+        names = ", ".join(key.removesuffix("_m") for key in self._rest)
+        rest = html(f"The command also requests: {names}.")
+        self.rest_text = gui.add_html(rest, visible=bool(self._rest))
+
+    def text(self, key: str) -> str:
+        """What is written in a field."""
+        return str(self.fields[key].value).strip()
+
+    def asked(self) -> dict[str, Any]:
+        """The request as arguments of `Prior.sample`; texts that name files are refused.
+
+        Raises:
+            InputError: a field cannot be read.
+        """
+        asked = dict(self._rest)
+        if floor := self.text("floor"):
+            read_floor(floor)  # raises if the text is not a floor, as it might then name a file
+            asked["floor"] = floor
+        if openings := self.text("openings").strip(","):
+            read_openings(openings)
+            asked["openings"] = openings
+        if want := self.text("want"):
+            asked["want"] = want
+        if ceiling := self.text("ceiling_m").removesuffix("m"):
+            try:
+                asked["ceiling_m"] = float(ceiling)
+            except ValueError:
+                raise InputError(
+                    f"The ceiling is '{ceiling[:40]}'; expected its height in metres, such as 2.6."
+                ) from None
+        return asked
+
+    def clear(self) -> None:
+        """Empty all fields, and drop the parts without a field."""
+        for field in self.fields.values():
+            field.value = ""
+        self._rest, self.rest_text.visible = {}, False
+
+
+def _texts_of(asked: Mapping[str, Any]) -> tuple[dict[str, str], dict[str, Any]]:
+    """Split a request into texts for the fields, and parts without a field."""
+    texts, rest = dict.fromkeys(_FIELDS, ""), {}
+    for key, value in asked.items():
+        if key == "ceiling_m":
+            texts[key] = f"{value:g}"
+        elif key in texts and isinstance(value, str):
+            texts[key] = value
+        elif key == "floor":
+            corners = np.asarray(value).tolist()
+            texts[key] = " ".join(f"{round(x, 3):g},{round(z, 3):g}" for x, z in corners)
+        elif key == "openings" and all(isinstance(each, str) for each in value):
+            texts[key] = ", ".join(value)
+        else:
+            rest[key] = value
+    return texts, rest
+
+
+def download(scene: Scene, form: str, shell: ShellName) -> tuple[str, bytes, list[str]]:
+    """The name of a room's file, its bytes, and notes for the user; several files are zipped.
+
+    Args:
+        form: One of `FORMATS`.
+        shell: Parts of the room itself to write, in the formats that leave a choice.
+
+    Raises:
+        InputError: the room cannot be written, or a package for it is not installed.
+    """
+    check_names([scene])
+    to, notes = FORMATS[form], []
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        if to.startswith("."):
+            save(scene, folder / f"{scene.name}{to}", shell=shell)
+        else:
+            chosen = shell if to in (*SIMULATORS, "obj") else None
+            notes = export_scenes([scene], to, folder, chosen)
+        files = sorted(path for path in folder.rglob("*") if path.is_file())
+        if len(files) == 1 and files[0].parent == folder:
+            return files[0].name, files[0].read_bytes(), notes
+        packed = io.BytesIO()
+        with zipfile.ZipFile(packed, "w") as archive:
+            for path in files:
+                # The entry has no date of today, so that the same room is the same file.
+                entry = zipfile.ZipInfo(path.relative_to(folder).as_posix())
+                archive.writestr(entry, path.read_bytes(), zipfile.ZIP_DEFLATED)
+    return f"{scene.name}_{to}.zip", packed.getvalue(), notes

@@ -1,6 +1,8 @@
 """The page in a real browser: it draws, the room follows the pointer, and buttons do their work."""
 
+import contextlib
 import time
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -10,6 +12,13 @@ from browser import picture, wait_for
 import sceneprior
 from sceneprior.apps.viewer.explorer import Explorer, Folder
 from sceneprior.core.scene import Scene, SceneObject
+
+pytest.importorskip("viser", reason="the extra `view` is not installed")
+
+from sceneprior.apps.viewer.panel import Panel, open_page
+from sceneprior.apps.viewer.server import serving
+
+pytestmark = pytest.mark.slow
 
 
 def words(browser) -> str:
@@ -42,22 +51,28 @@ def click(browser, text: str) -> None:
     browser.find_element("xpath", f"//*[text()='{text}']").click()
 
 
-@pytest.fixture(scope="module")
-def page(browser, toy_run):
-    pytest.importorskip("viser", reason="the extra `view` is not installed")
-    from sceneprior.apps.viewer.page import Page
-    from sceneprior.apps.viewer.server import serving
-
+@contextlib.contextmanager
+def opened(browser, source, title: str, **more) -> Iterator[Panel]:
+    """A page in the browser, once its room is framed."""
     with serving("127.0.0.1", 0) as server:
-        page = Page(server, Explorer(sceneprior.load(toy_run)), "toy rooms")
+        panel = open_page(server, source, title, **more)
         server.scene.configure_default_lights(cast_shadow=False)  # half of the time in software
         browser.set_window_size(1000, 700)
         browser.get_log("browser")
         browser.get(f"http://127.0.0.1:{server.get_port()}")
         wait_for(lambda: "Whole room in view" in words(browser), "no panel came")
-        wait_for(server.get_clients, "the browser did not connect")
-        yield page
+        wait_for(lambda: panel.page._eyes, "the room was not framed")
+        # viser warns that WebGL is drawn in software, right over the board.
+        close = "document.querySelectorAll('.mantine-Notification-closeButton')"
+        browser.execute_script(f"{close}.forEach(x => x.click())")
+        yield panel
         browser.get("about:blank")
+
+
+@pytest.fixture(scope="module")
+def page(browser, toy_run):
+    with opened(browser, Explorer(sceneprior.load(toy_run)), "toy rooms") as panel:
+        yield panel.page
 
 
 def test_the_room_follows_the_pointer(browser, page, monkeypatch):
@@ -65,11 +80,8 @@ def test_the_room_follows_the_pointer(browser, page, monkeypatch):
 
     assert "seed 0, from: paper" in words(browser)
     wait_for(lambda: len(np.unique(canvas(browser) // 32)) > 4, "nothing is drawn")
-    # viser warns that WebGL is drawn in software, right over the board.
-    close = "document.querySelectorAll('.mantine-Notification-closeButton').forEach(x => x.click())"
-    browser.execute_script(close)
     before = canvas(browser)
-    latent_map = page.board.plane.latent_map
+    latent_map = page.board.latent_map
     places = [
         (latent_map.middle[0] + t * latent_map.side, latent_map.middle[1] - t * latent_map.side)
         for t in np.linspace(-0.3, 0.3, 7)
@@ -82,7 +94,8 @@ def test_the_room_follows_the_pointer(browser, page, monkeypatch):
         shown.append((room, settled))
 
     monkeypatch.setattr(page, "show", noted)
-    points = [on_screen(page, point) for point in page.board.plane.in_scene(torch.tensor(places))]
+    points_m = page.board.in_scene(page.board.on_board(torch.tensor(places)))
+    points = [on_screen(page, point_m) for point_m in points_m]
     # Step by step: of a browser that is slow to draw, a gesture at once is over before it is seen.
     for number, (x, y) in enumerate(points):
         mouse = ActionChains(browser, duration=50)
@@ -105,22 +118,6 @@ def test_the_room_follows_the_pointer(browser, page, monkeypatch):
     assert [said for said in log if "passive event listener" not in said] == []
 
 
-def test_objects_are_kept_by_a_click_and_the_rest_is_completed(browser, page):
-    from selenium.webdriver import ActionChains
-
-    item = page.shown.scene.objects[0]
-    x, y = on_screen(page, np.add(item.center_m, (0, item.size_m[1] / 2, 0)))
-    mouse = ActionChains(browser)
-    mouse.w3c_actions.pointer_action.move_to_location(int(x), int(y)).click()
-    mouse.perform()
-    wait_for(lambda: page.shown.kept, "no object is kept")
-    (row,) = page.shown.kept
-    kept = page.shown.scene.objects[row]
-    click(browser, "Complete the rest")
-    wait_for(lambda: "completed around 1 kept objects" in words(browser), "it was not completed")
-    assert page.shown.scene.objects[0].center_m == kept.center_m
-
-
 def test_what_does_not_work_is_said(browser, page):
     click(browser, "Path")  # the folder opens
     wait_for(lambda: "Draw path" in words(browser), "the folder stays closed")
@@ -136,29 +133,33 @@ def test_what_does_not_work_is_said(browser, page):
     wait_for(asked_again, "no sentence came")
 
 
-def test_a_request_is_typed_answered_and_downloaded(browser, tmp_path):
-    pytest.importorskip("viser", reason="the extra `view` is not installed")
-    from sceneprior.apps.viewer.page import Page
-    from sceneprior.apps.viewer.server import serving
+def test_a_request_is_typed_answered_completed_and_downloaded(browser, tmp_path):
+    from selenium.webdriver import ActionChains
 
-    with serving("127.0.0.1", 0) as server:
-        asked = {"want": "two nightstands"}
-        page = Page(server, Explorer(sceneprior.load("procthor-bedroom")), "rooms", asked=asked)
-        server.scene.configure_default_lights(cast_shadow=False)
-        browser.set_window_size(900, 640)
-        browser.get(f"http://127.0.0.1:{server.get_port()}")
-        wait_for(lambda: "Make room" in words(browser), "no panel came")
-        floor = browser.find_element("xpath", "//label[text()='Floor']/following::input[1]")
-        floor.send_keys("5x4")
-        doors = browser.find_element("xpath", "//label[text()='Doors']/following::input[1]")
-        doors.send_keys("door@3:1.2")
-        wait_for(lambda: page.panel._fields.openings.value == "door@3:1.2", "nothing was typed")
+    source, asked = Explorer(sceneprior.load("procthor-bedroom")), {"want": "two nightstands"}
+    with opened(browser, source, "rooms", asked=asked) as panel:
+        page = panel.page
+        for label, text in (("Floor", "5x4"), ("Doors", "door@3:1.2")):
+            field = f"//label[text()='{label}']/following::input[1]"
+            browser.find_element("xpath", field).send_keys(text)
+        wait_for(lambda: panel.request.text("openings") == "door@3:1.2", "nothing was typed")
         click(browser, "Make room")
         wait_for(lambda: page.scene.openings, "no room was made")
         wait_for(
             lambda: "1 door" in words(browser) and "✓ 2 nightstand" in words(browser), "silence"
         )
         np.testing.assert_allclose(np.ptp(page.scene.floor_m, axis=0), [5, 4])
+        item = page.shown.scene.objects[0]
+        x, y = on_screen(page, np.add(item.center_m, (0, item.size_m[1] / 2, 0)))
+        mouse = ActionChains(browser)
+        mouse.w3c_actions.pointer_action.move_to_location(int(x), int(y)).click()
+        mouse.perform()
+        wait_for(lambda: page.shown.kept, "no object is kept")
+        (row,) = page.shown.kept
+        kept = page.shown.scene.objects[row]
+        click(browser, "Complete the rest")
+        wait_for(lambda: "completed around 1 kept objects" in words(browser), "not completed")
+        assert page.shown.scene.objects[0].center_m == kept.center_m
         folder = {"behavior": "allow", "downloadPath": str(tmp_path)}
         browser.execute_cdp_cmd("Page.setDownloadBehavior", folder)
         button = browser.find_element("xpath", "//button[.//text()='Download']")
@@ -166,28 +167,18 @@ def test_a_request_is_typed_answered_and_downloaded(browser, tmp_path):
         file = tmp_path / f"{page.scene.name}.glb"
         wait_for(file.is_file, "no file came")
         assert b"wall_3" in file.read_bytes()
-        browser.get("about:blank")
 
 
 def test_a_room_of_a_stranger_runs_nothing(browser):
-    pytest.importorskip("viser", reason="the extra `view` is not installed")
-    from sceneprior.apps.viewer.page import Page
-    from sceneprior.apps.viewer.server import serving
-
-    name, label = (
-        "<iframe srcdoc='<script>parent.hacked=1</script>'>",
-        "<img src=x onerror=hacked=1>",
-    )
+    name = "<iframe srcdoc='<script>parent.hacked=1</script>'>"
+    label = "<img src=x onerror=hacked=1>"
     item = SceneObject(label, (0.0, 0.5, 0.0), (1.0, 1.0, 1.0))
-    with serving("127.0.0.1", 0) as server:
-        page = Page(server, Folder([Scene(name, f"void,{label}", (item,))]), label)
-        browser.get(f"http://127.0.0.1:{server.get_port()}")
+    with opened(browser, Folder([Scene(name, f"void,{label}", (item,))]), label) as panel:
         wait_for(lambda: name in words(browser), "the room's name is not shown as it is")
-        page.panel.names.value = True
+        click(browser, "Names and sizes")
         wait_for(lambda: words(browser).count(label) >= 2, "class and title are not shown")
+        assert panel.page.display.names
         assert browser.execute_script("return window.hacked") is None
-        own = (
-            "[...document.querySelectorAll('img, iframe')].filter(x => !x.src.startsWith('data:'))"
-        )
-        assert browser.execute_script(f"return {own}.length") == 0
-        browser.get("about:blank")
+        strange = "x => !x.src.startsWith('data:')"
+        count = f"[...document.querySelectorAll('img, iframe')].filter({strange}).length"
+        assert browser.execute_script(f"return {count}") == 0

@@ -6,7 +6,7 @@ import numpy as np
 from markupsafe import Markup
 
 from sceneprior.apps.viewer.explorer import Shown
-from sceneprior.apps.viewer.nodes import name_and_size
+from sceneprior.apps.viewer.scene_nodes import name_and_size
 from sceneprior.core.scene import Scene
 from sceneprior.render.appearance import object_colors
 
@@ -31,7 +31,7 @@ def html(text: str) -> str:
     return str(_TEXT.format(text))
 
 
-def room_words(shown: Shown, scene: Scene) -> Markup:
+def room_html(shown: Shown, scene: Scene) -> Markup:
     """The shown room: its origin, its floor, and its objects in the colours of their classes, with
     kept objects in bold."""
     lines = []
@@ -41,10 +41,10 @@ def room_words(shown: Shown, scene: Scene) -> Markup:
         name = Markup("<b>{}</b>" if row in shown.kept else "{}").format(name_and_size(item))
         lines.append(Markup("<li>{}{}</li>").format(_SWATCH.format(*color), name))
     rows = Markup().join(lines) or Markup("<li>nothing: an empty room</li>")
-    return Markup("<b>{}</b>{}{}").format(shown.origin, floor_words(scene), _LIST.format(rows))
+    return Markup("<b>{}</b>{}{}").format(shown.origin, _floor_html(scene), _LIST.format(rows))
 
 
-def floor_words(scene: Scene) -> Markup:
+def _floor_html(scene: Scene) -> Markup:
     """The extents of a room's floor, and its doors and windows; empty if the floor is unknown."""
     if scene.floor_m is None:
         return Markup()
@@ -56,25 +56,21 @@ def floor_words(scene: Scene) -> Markup:
     return Markup("<br>Floor: {}").format(", ".join(parts))
 
 
-def wish_words(scene: Scene) -> Markup:
+def wishes_html(scene: Scene) -> Markup:
     """The wishes of a requested room, each marked as fulfilled or not."""
     wishes: Any = scene.extra.get("wishes")
     if not isinstance(wishes, list) or not wishes:  # a file may hold anything
         return Markup()
-    lines = [
-        Markup("<li>✓ {}</li>").format(_wish(each))
-        if each.get("holds") is True
-        else Markup("<li>{}</li>").format(_WORSE.format(f"✗ {_wish(each)}: not fulfilled"))
-        for each in wishes
-        if isinstance(each, dict)
-    ]
+    lines = []
+    for each in wishes:
+        if isinstance(each, dict):
+            wish = str(each.get("wish")).replace("_", " ")
+            holds = each.get("holds") is True
+            text = f"✓ {wish}" if holds else error_html(f"✗ {wish}: not fulfilled")
+            lines.append(Markup("<li>{}</li>").format(text))
     return Markup("<b>Wishes</b>{}").format(_LIST.format(Markup().join(lines)))
 
 
-def _wish(entry: dict[str, Any]) -> str:
-    return str(entry.get("wish")).replace("_", " ")
-
-
-def error_words(sentence: str) -> Markup:
-    """Format the reason why a request cannot be met."""
+def error_html(sentence: str) -> Markup:
+    """The reason why a request cannot be met."""
     return _WORSE.format(sentence)
