@@ -1,6 +1,7 @@
 """Helpers for tests of commands: sentences on the error stream, and unchanged folders."""
 
 from pathlib import Path
+from typing import Any
 
 from refusals import refused
 from typer.testing import CliRunner
