@@ -31,8 +31,8 @@ from sceneprior.core.scene import Mesh
 from sceneprior.core.shards import iterate_rooms
 from sceneprior.core.views import SceneViews
 from sceneprior.lifted.lifting.dataset import LiftedDataset
-from sceneprior.lifted.lifting.shapes import ShapeGrid
-from sceneprior.lifted.looks import LookConfig
+from sceneprior.lifted.lifting.hulls import ShapeGrid
+from sceneprior.lifted.prototype_decoder import PrototypeConfig
 from sceneprior.paper.losses import mask_loss
 from sceneprior.paper.matching import Matches
 from sceneprior.render.offscreen.renderer import Pinhole, SoftwareRenderer
@@ -99,9 +99,9 @@ def lift_rooms(shards: Path, seed: int) -> list[list[Mesh]]:
                 (Path(name) / each.name).symlink_to(each.resolve())
         lifted = LiftedDataset(Path(name), "train", view_fraction=FITTED, shape=GRID, seed=seed)
     prototypes = lifted.find_prototypes(1024)
-    shapes = LookConfig(prototypes=1024, cells=GRID.cells, margin=GRID.margin).build(1)
-    shapes.learn_prototypes(prototypes)
-    looks = iter(lifted.looks_of(prototypes).tolist())
+    shapes = PrototypeConfig(prototypes=1024, cells=GRID.cells, margin=GRID.margin).build(1)
+    shapes.set_prototypes(prototypes)
+    looks = iter(lifted.posed_prototypes(prototypes).tolist())
     rooms = []
     for room in lifted.boxes:
         found = []

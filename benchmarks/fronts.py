@@ -19,13 +19,13 @@ from jaxtyping import Bool
 import sceneprior
 from sceneprior.core.classes import label_set
 from sceneprior.core.shards import iterate_rooms
+from sceneprior.lifted.config import TrainedLifted
+from sceneprior.lifted.lifting import ShapeGrid
 from sceneprior.lifted.lifting.dataset import LiftedDataset
-from sceneprior.lifted.lifting.lifted import ShapeGrid
-from sceneprior.lifted.looks import LookDecoder
+from sceneprior.lifted.prototype_decoder import PrototypeDecoder
 from sceneprior.lifted.prototypes import POSES
 from sceneprior.lifted.requests.relations import OUTWARD
 from sceneprior.lifted.sampler.frames import side_of
-from sceneprior.lifted.trained import TrainedLifted
 
 WITHOUT_FRONT = ("lamp", "table", "stool")
 """Words in the names of classes without a front; a `dressing_table` has one."""
@@ -42,10 +42,10 @@ def main() -> None:
     trained = sceneprior.load(arguments.prior).trained
     assert isinstance(trained, TrainedLifted) and trained.sampler is not None
     shapes = trained.prior.shape
-    assert isinstance(shapes, LookDecoder)
+    assert isinstance(shapes, PrototypeDecoder)
     grid = ShapeGrid(shapes.cells, shapes.margin)
     lifted = LiftedDataset(arguments.shards, arguments.split, shape=grid)
-    looks = torch.from_numpy(lifted.looks_of(shapes.prototypes.common_alone()))
+    looks = torch.from_numpy(lifted.posed_prototypes(shapes.prototypes.common_alone()))
     yaws = [
         shard.read_ground_truth(name).yaw_rad[: len(shard.read_room(name).object_class)]
         for shard, name in iterate_rooms(arguments.shards, arguments.split)

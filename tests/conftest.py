@@ -154,7 +154,7 @@ def few_attempts(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def grid_prior(trained):
     """The toy run's prior with occupancy grids for shapes, which are untrained."""
-    from sceneprior.lifted.trained import TrainedLifted
+    from sceneprior.lifted.config import TrainedLifted
 
     shards = Path(trained.config.data.shards)
     config = tiny_lifted(shards)

@@ -3,9 +3,9 @@
 import numpy as np
 
 from sceneprior.core.parts import ACROSS_X, ACROSS_Z, BOX, Parts
-from sceneprior.lifted.lifting.lifted import RayPool
-from sceneprior.lifted.lifting.part_prices import LEVELS
+from sceneprior.lifted.lifting import RayPool
 from sceneprior.lifted.lifting.part_rays import meets
+from sceneprior.lifted.lifting.part_regularizers import LEVELS
 
 
 def boxes(*ends, mirrored=()) -> Parts:

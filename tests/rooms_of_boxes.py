@@ -8,10 +8,10 @@ from parts_of_rooms import boxes, rays_of
 
 from sceneprior.core.parts import Parts, filled_cells
 from sceneprior.core.wall_lines import Wall
+from sceneprior.lifted.lifting import LiftedBoxes, RayPool, ShapeGrid
 from sceneprior.lifted.lifting.cache import LiftedCache
 from sceneprior.lifted.lifting.dataset import LiftedDataset
-from sceneprior.lifted.lifting.lifted import LiftedBoxes, RayPool, ShapeGrid
-from sceneprior.lifted.looks import LookConfig, LookDecoder
+from sceneprior.lifted.prototype_decoder import PrototypeConfig, PrototypeDecoder
 from sceneprior.lifted.sampler.network import RoomSampler
 from sceneprior.lifted.sampler.rooms import SamplerRooms
 from sceneprior.lifted.sampler.settings import SamplerConfig
@@ -68,14 +68,16 @@ def lifted_rooms(count: int = 6, seed: int = 0) -> Lifted:
 
 def sampler_rooms(count: int = 6, seed: int = 0) -> SamplerRooms:
     """The same with looks, of prototypes that the first six rooms have."""
-    return SamplerRooms(lifted_rooms(count, seed)).see_looks(lifted_rooms().find_prototypes(99))
+    return SamplerRooms(lifted_rooms(count, seed)).assign_prototypes(
+        lifted_rooms().find_prototypes(99)
+    )
 
 
-def small_decoder() -> LookDecoder:
+def small_decoder() -> PrototypeDecoder:
     """A decoder that knows the shapes above."""
-    config = LookConfig(prototypes=PROTOTYPES, codes=CODES, width=8, cells=CELLS, margin=1.0)
-    decoder = LookDecoder(4, config)
-    decoder.learn_prototypes(lifted_rooms().find_prototypes(99))
+    config = PrototypeConfig(prototypes=PROTOTYPES, codes=CODES, width=8, cells=CELLS, margin=1.0)
+    decoder = PrototypeDecoder(4, config)
+    decoder.set_prototypes(lifted_rooms().find_prototypes(99))
     return decoder
 
 

@@ -95,7 +95,7 @@ class DecodedScenes:
     """Mesh vertices in the room frame; None before the shape decoder has run, and if it predicts
     `looks`."""
     shape_codes: Float[Tensor, "rooms objects codes"] | None = None
-    """Predicted shape codes (`lifted/looks.py`); None if shapes are deformed meshes."""
+    """Predicted shape codes (`lifted/prototype_decoder.py`); None if shapes are deformed meshes."""
     looks: Int[Tensor, "rooms objects"] | None = None
     """Look of each object, that is, its prototype and pose as one index: prototype * 8 + pose
     (`lifted/prototypes.py`). None before the shape decoder has run, and if it predicts meshes."""

@@ -27,10 +27,10 @@ from sceneprior.core.scene import Scene
 from sceneprior.core.scene_json import check_box
 from sceneprior.core.seeds import check_seed
 from sceneprior.core.views import DecodedScenes, RoomBoxes
+from sceneprior.lifted.config import TrainedLifted
 from sceneprior.lifted.insert import insert
 from sceneprior.lifted.sampled import class_rows, drawn_by_sampler, floor_rectangle, sample_scenes
 from sceneprior.lifted.sampler.plan import Given
-from sceneprior.lifted.trained import TrainedLifted
 from sceneprior.paper.decode import decode_latents
 from sceneprior.paper.losses import take
 from sceneprior.paper.matching import assign

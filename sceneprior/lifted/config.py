@@ -2,6 +2,7 @@
 
 import contextlib
 import warnings
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
@@ -13,14 +14,14 @@ from torch import nn
 from sceneprior.core.errors import InputWarning, ShardError
 from sceneprior.core.settings import Section
 from sceneprior.core.shards import list_shards
+from sceneprior.lifted.lifting import ShapeGrid
 from sceneprior.lifted.lifting.dataset import LiftedDataset
-from sceneprior.lifted.lifting.lifted import ShapeGrid
-from sceneprior.lifted.looks import LookConfig, LookDecoder
+from sceneprior.lifted.losses import LiftedLossConfig
+from sceneprior.lifted.prototype_decoder import PrototypeConfig, PrototypeDecoder
 from sceneprior.lifted.sampler.network import RoomSampler
 from sceneprior.lifted.sampler.rooms import SamplerRooms
 from sceneprior.lifted.sampler.settings import SamplerConfig
-from sceneprior.lifted.trained import SAMPLER, TrainedLifted
-from sceneprior.paper.prior import ModelConfig, PriorConfig
+from sceneprior.paper.prior import ModelConfig, PriorConfig, TrainedPrior
 from sceneprior.paper.settings import LatentStageConfig
 from sceneprior.paper.transformer import TransformerConfig
 from sceneprior.training.method import Stage, ready_copy
@@ -30,24 +31,10 @@ if TYPE_CHECKING:
     from sceneprior.lifted.stages import LiftedStage
 
 
+SAMPLER = "sampler"
+"""Name of the distribution that draws rooms object by object with the sampler, without a latent."""
 FEW_ROOMS = 24
 """Number of training rooms below which training warns: docs/captures.md advises a few dozen."""
-
-
-class LiftedLossConfig(Section):
-    """Weights of the losses against lifted boxes and shapes."""
-
-    class_: float = Field(1.0, ge=0, alias="class")
-    box: float = Field(5.0, ge=0)
-    completeness: float = Field(1.0, ge=0)
-    shape: float = Field(2.0, ge=0)
-    """Weight of the distance between decoded and lifted shapes."""
-    latents: float = Field(0.0, ge=0)
-    """Weight of the sliced Wasserstein distance between the training rooms' logits and N(0, 1),
-    from which the logits of new rooms are sampled; with it, a larger part of the sphere decodes
-    into rooms."""
-    match_box: float = Field(5.0, ge=0)
-    """lambda_B of the matching cost."""
 
 
 class LiftedStageConfig(LatentStageConfig):
@@ -74,7 +61,7 @@ class LiftedModel(ModelConfig):
     """The paper's network, with looks (`lifted/prototypes.py`) in place of deformed templates."""
 
     decoder: TransformerConfig
-    shape: LookConfig = LookConfig()
+    shape: PrototypeConfig = PrototypeConfig()
 
 
 class LiftedConfig(PriorConfig):
@@ -122,7 +109,9 @@ class LiftedConfig(PriorConfig):
             networks["sampler"] = self.build_sampler(self.sampler)
         return networks
 
-    def trained(self, networks: nn.Module, stage: str, room_ids: tuple[str, ...]) -> TrainedLifted:
+    def trained(
+        self, networks: nn.Module, stage: str, room_ids: tuple[str, ...]
+    ) -> "TrainedLifted":
         plain = super().trained(networks, stage, room_ids)
         sampler = ready_copy(networks.sampler) if hasattr(networks, "sampler") else None
         return TrainedLifted(plain.prior, plain.logits, room_ids, self, stage, sampler)
@@ -166,8 +155,8 @@ class LiftedConfig(PriorConfig):
                 stacklevel=2,
             )
         prior, latents = self.build_prior(), self.build_latents(len(rooms))
-        assert isinstance(prior.shape, LookDecoder)
-        prior.shape.learn_prototypes(rooms.find_prototypes(self.model.shape.prototypes))
+        assert isinstance(prior.shape, PrototypeDecoder)
+        prior.shape.set_prototypes(rooms.find_prototypes(self.model.shape.prototypes))
         target = self.model.completeness_target
         return LiftedStage(prior, latents, rooms, self.shape, self.loss, target, self.seed)
 
@@ -178,13 +167,34 @@ class LiftedConfig(PriorConfig):
 
         assert previous is not None, "the shape stage comes before"
         before = self.before(previous, rooms.room_ids)
-        assert isinstance(before.prior.shape, LookDecoder)
+        assert isinstance(before.prior.shape, PrototypeDecoder)
         prototypes = before.prior.shape.prototypes
         sampler = self.build_sampler(stage)
-        teach(sampler, rooms.see_looks(prototypes))
+        teach(sampler, rooms.assign_prototypes(prototypes))
         val = None
         with contextlib.suppress(ShardError):  # no val rooms: the newest network is kept
             list_shards(Path(self.data.shards), "val")
-            val = self._sampler_rooms("val").see_looks(prototypes)
+            val = self._sampler_rooms("val").assign_prototypes(prototypes)
         latents = nn.Embedding.from_pretrained(before.logits)
         return SamplerStage(before.prior, latents, sampler, stage, val, self.seed)
+
+
+@dataclass(frozen=True)
+class TrainedLifted(TrainedPrior):
+    """A prior whose shapes are looks, and the sampler of its run."""
+
+    sampler: RoomSampler | None = None
+    """None before the sampler's stage has begun, and in runs without a sampler."""
+
+    @property
+    def distribution(self) -> str:
+        """Default distribution of new rooms: `sampler` if the settings say so and the run has a
+        sampler; else the distribution of latents."""
+        with_sampler = self.sampler is not None and self.config.distribution == SAMPLER
+        return SAMPLER if with_sampler else self.latent_distribution
+
+    @property
+    def latent_distribution(self) -> str:
+        """Distribution of new latents, for tasks that need a latent."""
+        own = self.config.distribution
+        return own if self.remembers_rooms and own != SAMPLER else "paper"

@@ -8,9 +8,11 @@ frustum loss is needed.
 
 import torch
 from jaxtyping import Bool, Float
+from pydantic import Field
 from torch import Tensor
 from torch.nn import functional as F
 
+from sceneprior.core.settings import Section
 from sceneprior.core.views import DecodedScenes, LiftedRooms
 from sceneprior.paper.losses import class_loss, completeness_targets, mean_of_objects, take
 from sceneprior.paper.matching import Matches, assign, class_cost
@@ -20,6 +22,22 @@ PER_METRE = 1 / 6
 of view of 90 degrees. So lambda_box and lambda_B have about the same effect as for 2D boxes."""
 DIRECTIONS = 32
 """Number of projection directions per step. Each step draws new ones, so a stage uses thousands."""
+
+
+class LiftedLossConfig(Section):
+    """Weights of the losses against lifted boxes and shapes."""
+
+    class_: float = Field(1.0, ge=0, alias="class")
+    box: float = Field(5.0, ge=0)
+    completeness: float = Field(1.0, ge=0)
+    shape: float = Field(2.0, ge=0)
+    """Weight of the distance between decoded and lifted shapes."""
+    latents: float = Field(0.0, ge=0)
+    """Weight of the sliced Wasserstein distance between the training rooms' logits and N(0, 1),
+    from which the logits of new rooms are sampled; with it, a larger part of the sphere decodes
+    into rooms."""
+    match_box: float = Field(5.0, ge=0)
+    """lambda_B of the matching cost."""
 
 
 @torch.no_grad()
@@ -89,7 +107,7 @@ def shape_code_loss(
     squared distance of two codes is about the number of grid cells in which their shapes differ,
     and cells_j is the number of cells that the lifted shape fills. Without the division, a lamp on
     a cord, which fills a hundredth of its box, would hardly be learnt. `codes` holds a_j and
-    `cells` cells_j, from the objects' looks (`LookDecoder.targets`).
+    `cells` cells_j, from the objects' looks (`PrototypeDecoder.targets`).
     """
     assert scenes.shape_codes is not None, "the prior decodes looks"
     apart = take(scenes.shape_codes, matches.prediction, dim=1) - codes

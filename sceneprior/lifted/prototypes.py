@@ -108,7 +108,7 @@ def _covering(
     return np.array(items, dtype=np.int64), np.array(common, dtype=bool)
 
 
-def looks_apart(
+def embed_posed(
     grids: Bool[np.ndarray, "prototypes x y z"], codes: int
 ) -> Float[np.ndarray, "looks codes"]:
     """Code vectors of all looks: the leading principal components of their grids.
@@ -168,7 +168,7 @@ def turned_extents(extents: Float[np.ndarray, "n 3"], pose: int) -> Float[np.nda
     return extents[:, ::-1] if pose % 2 else extents
 
 
-def turned_looks(
+def turn_posed(
     looks: Int[Tensor, "rooms objects"],
     quarters: Int[Tensor, " rooms"],
     mirrored: Bool[Tensor, " rooms"],

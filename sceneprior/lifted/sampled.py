@@ -13,13 +13,13 @@ from sceneprior.core.outline import rectangle
 from sceneprior.core.scene import Mesh, Scene, SceneObject, Solid, quarter_turned
 from sceneprior.core.threads import single_threaded
 from sceneprior.core.views import RoomBoxes
-from sceneprior.lifted.lifting.lifted import HANGS_M
-from sceneprior.lifted.looks import LookDecoder
+from sceneprior.lifted.config import SAMPLER, TrainedLifted
+from sceneprior.lifted.lifting import HANGS_M
+from sceneprior.lifted.prototype_decoder import PrototypeDecoder
 from sceneprior.lifted.prototypes import POSES
 from sceneprior.lifted.sampler.draw import draw_rooms
 from sceneprior.lifted.sampler.frames import side_of
 from sceneprior.lifted.sampler.plan import Given
-from sceneprior.lifted.trained import SAMPLER, TrainedLifted
 from sceneprior.paper.prior import TrainedPrior
 
 
@@ -58,7 +58,7 @@ def scene_of(trained: TrainedLifted, name: str, rooms: RoomBoxes, row: int) -> S
     """
     sampler, shapes = trained.sampler, trained.prior.shape
     assert sampler is not None, "callers ask trained.sampler first"
-    assert isinstance(shapes, LookDecoder), "whose looks the sampler draws"
+    assert isinstance(shapes, PrototypeDecoder), "whose looks the sampler draws"
     assert rooms.looks is not None
     classes = label_set(trained.config.label_set)
     fronts = side_of(rooms.looks[row], sampler.fronts)
@@ -87,7 +87,7 @@ def scene_of(trained: TrainedLifted, name: str, rooms: RoomBoxes, row: int) -> S
 
 
 def _shape_in(
-    shapes: LookDecoder, look: int, box_m: Float[np.ndarray, "6"]
+    shapes: PrototypeDecoder, look: int, box_m: Float[np.ndarray, "6"]
 ) -> tuple[Mesh, tuple[Solid, ...]]:
     """Mesh and solids of a look in a box. If the box stands on the floor, so does the shape: masks
     show too little of the lowest parts of some prototypes."""

@@ -4,16 +4,16 @@ import torch
 from torch import Tensor
 
 from sceneprior.core.views import LiftedRooms
-from sceneprior.lifted.config import LiftedLossConfig, LiftedStageConfig
 from sceneprior.lifted.lifting.dataset import LiftedDataset
-from sceneprior.lifted.looks import LookDecoder
 from sceneprior.lifted.losses import (
+    LiftedLossConfig,
     latent_loss,
     lifted_losses,
     match_lifted,
     needed_predictions,
     shape_code_loss,
 )
+from sceneprior.lifted.prototype_decoder import PrototypeDecoder
 from sceneprior.paper.stages import LatentStage
 from sceneprior.training.steps import batch_seed, check_finite, full_precision
 
@@ -21,19 +21,18 @@ from sceneprior.training.steps import batch_seed, check_finite, full_precision
 class LiftedStage(LatentStage):
     """Trains with the layout loss against lifted 3D boxes, and the distance to lifted shapes."""
 
-    stage: LiftedStageConfig
     loss: LiftedLossConfig
     rooms: LiftedDataset
 
     @property
-    def looks(self) -> LookDecoder:
+    def looks(self) -> PrototypeDecoder:
         """The shape decoder."""
-        assert isinstance(self.prior.shape, LookDecoder)
+        assert isinstance(self.prior.shape, PrototypeDecoder)
         return self.prior.shape
 
     def on_fit_start(self) -> None:
         # Done only now, since a resumed run has just loaded its checkpoint's prototypes.
-        self.rooms.see_looks(self.looks.prototypes)
+        self.rooms.assign_prototypes(self.looks.prototypes)
 
     def training_step(self, rooms: LiftedRooms, batch_idx: int) -> Tensor:
         slots = min(rooms.is_object.shape[1] + 1, self.prior.max_objects)

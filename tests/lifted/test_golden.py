@@ -14,9 +14,9 @@ import torch
 from tiny_runs import tiny_config, tiny_lifted
 
 from sceneprior.core.observed_image import as_views
+from sceneprior.lifted.config import TrainedLifted
 from sceneprior.lifted.losses import latent_loss, lifted_losses, match_lifted, shape_code_loss
 from sceneprior.lifted.reconstruction.objects import answer_images
-from sceneprior.lifted.trained import TrainedLifted
 from sceneprior.paper.fit_image import FitSchedule, fit_latents_to_images
 from sceneprior.paper.interpolate import interpolate
 from sceneprior.paper.losses import mask_loss
@@ -56,7 +56,7 @@ def lifted(toy_shards, rooms):
     """An untrained prior of the lifted method, with the toy rooms' prototypes."""
     config = tiny_lifted(toy_shards)
     prior = untrained(config)
-    prior.shape.learn_prototypes(rooms.find_prototypes(config.model.shape.prototypes))
+    prior.shape.set_prototypes(rooms.find_prototypes(config.model.shape.prototypes))
     logits = config.build_latents(12).weight.detach() * 2
     return TrainedLifted(prior, logits, tuple(rooms.plain_ids), config, "shape")
 
@@ -95,7 +95,7 @@ def test_prototypes_and_the_poses_in_which_objects_show_them(rooms, lifted):
         common=prototypes.common,
         filled=prototypes.grids.mean(axis=(1, 2, 3)),
         parts=[len(each.kind) for each in prototypes.parts],
-        looks=rooms.looks_of(prototypes),
+        looks=rooms.posed_prototypes(prototypes),
     )
 
 
@@ -126,7 +126,7 @@ def test_losses_of_views(paper, images):
 
 
 def test_losses_against_lifted_boxes(lifted, rooms):
-    rooms.see_looks(lifted.prior.shape.prototypes)
+    rooms.assign_prototypes(lifted.prior.shape.prototypes)
     batch = rooms.__getitems__([(0, 0), (3, 0)])
     scenes = lifted.prior(lifted.logits[[0, 3]])
     matches = match_lifted(scenes, batch)

@@ -11,12 +11,12 @@ from sceneprior.lifted.prototypes import (
     POSES,
     Prototypes,
     choose_prototypes,
-    looks_apart,
+    embed_posed,
     pooled,
     pose_distances,
     turn_of,
+    turn_posed,
     turned_extents,
-    turned_looks,
 )
 
 RNG = np.random.default_rng(0)
@@ -91,7 +91,7 @@ def test_thin_things_are_as_far_apart_as_full_ones(layers):
 @pytest.mark.parametrize("codes", [3, 40])
 def test_codes_are_as_far_apart_as_the_grids_of_looks(codes):
     grids = RNG.random((4, CELLS, CELLS, CELLS)) < 0.5
-    found = looks_apart(grids, codes)
+    found = embed_posed(grids, codes)
     flat = np.concatenate(
         [
             turn_grids(grid[None], *turn_of(pose)).reshape(1, -1)
@@ -117,7 +117,7 @@ def test_codes_are_as_far_apart_as_the_grids_of_looks(codes):
 @pytest.mark.parametrize("quarters", range(4))
 def test_looks_turn_as_grids_do(quarters, mirrored):
     looks = torch.arange(POSES)[None] + 3 * POSES
-    turned = turned_looks(looks, torch.tensor([quarters]), torch.tensor([mirrored]))[0]
+    turned = turn_posed(looks, torch.tensor([quarters]), torch.tensor([mirrored]))[0]
     assert (turned // POSES == 3).all()
     for pose, after in enumerate((turned % POSES).tolist()):
         here = turn_grids(ODD[None], *turn_of(pose))

@@ -12,7 +12,7 @@ from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.lifted.complete import complete
-from sceneprior.lifted.lifting.lifted import HANGS_M
+from sceneprior.lifted.lifting import HANGS_M
 from sceneprior.lifted.sampler.draw import draw_rooms
 from sceneprior.paper.sampling import draw_latents
 

@@ -90,7 +90,7 @@ def test_looks_become_meshes_in_the_boxes_of_objects_that_are_kept(decoded, tmp_
     halves = boxes((0, 64, 0, 32, 0, 64)), boxes((0, 32, 0, 64, 0, 64))
     grids = np.stack([filled_cells(each, 8, 1.1) for each in halves])
     prior = tiny_lifted(tmp_path).build_prior()
-    prior.shape.learn_prototypes(
+    prior.shape.set_prototypes(
         Prototypes(halves, grids, np.ones((2, 3)), np.array([9, 13]), np.ones(2, dtype=bool))
     )
     looks = torch.tensor([[0, POSES, 0, 0], [0, 0, 0, 0]])

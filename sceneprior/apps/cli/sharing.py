@@ -34,7 +34,7 @@ def pack(
     from sceneprior.apps.priors.packed import pack as packed_of
     from sceneprior.apps.priors.packed import write_packed
     from sceneprior.core.files import read_json
-    from sceneprior.lifted.trained import SAMPLER
+    from sceneprior.lifted.config import SAMPLER
     from sceneprior.paper.prior import TrainedPrior
 
     if out.exists() and (out.is_dir() or not overwrite):

@@ -19,8 +19,7 @@ from sceneprior.apps.experiments.comparison import (
 from sceneprior.apps.reconstruction.reconstruct import OBJECTS
 from sceneprior.core.errors import ConfigError
 from sceneprior.core.settings import read_settings
-from sceneprior.lifted.config import LiftedConfig
-from sceneprior.lifted.trained import SAMPLER
+from sceneprior.lifted.config import SAMPLER, LiftedConfig
 from sceneprior.paper.config import PaperConfig
 from sceneprior.training.method import RunConfig
 

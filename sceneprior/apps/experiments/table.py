@@ -15,7 +15,7 @@ from sceneprior.apps.experiments.runs import LIFTED, PAPER, Run, Variant, varian
 from sceneprior.core.files import write_whole
 from sceneprior.evaluation.metric import ARROWS, TableColumn
 from sceneprior.evaluation.registry import DECODED, METRICS
-from sceneprior.lifted.trained import SAMPLER
+from sceneprior.lifted.config import SAMPLER
 from sceneprior.paper.sampling import marked
 from sceneprior.training.checkpoints import read_checkpoint
 

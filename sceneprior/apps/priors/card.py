@@ -11,7 +11,7 @@ from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.files import read_json
 from sceneprior.core.shards import INDEX_NAME
 from sceneprior.evaluation.score_table import headings, score_rows
-from sceneprior.lifted.trained import TrainedLifted
+from sceneprior.lifted.config import TrainedLifted
 from sceneprior.paper.prior import TrainedPrior
 from sceneprior.training.method import Trained
 

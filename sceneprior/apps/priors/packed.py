@@ -31,7 +31,7 @@ from sceneprior.core.files import json_text, write_whole
 from sceneprior.core.geometry.turns import QUARTERS
 from sceneprior.core.parts import KINDS
 from sceneprior.core.settings import Section, check_settings
-from sceneprior.lifted.trained import TrainedLifted
+from sceneprior.lifted.config import TrainedLifted
 from sceneprior.paper.prior import TrainedPrior
 from sceneprior.training.method import RunConfig, Trained
 

@@ -18,8 +18,8 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene
 from sceneprior.evaluation.layout_distance import nearest_room
 from sceneprior.evaluation.metrics.contents import common_label_set
-from sceneprior.lifted.looks import LookDecoder
-from sceneprior.lifted.trained import SAMPLER, TrainedLifted
+from sceneprior.lifted.config import SAMPLER, TrainedLifted
+from sceneprior.lifted.prototype_decoder import PrototypeDecoder
 from sceneprior.paper.decode import decode_latents, to_rooms
 from sceneprior.paper.interpolate import RoomPath, even_places
 from sceneprior.paper.prior import TrainedPrior, with_training_latents
@@ -218,7 +218,7 @@ class Explorer:
     def find_meshes(self, stop: threading.Event) -> None:
         """Extract the meshes of all shape prototypes in advance, so that no room has to wait."""
         trained = self.prior.trained
-        if isinstance(trained, TrainedPrior) and isinstance(trained.prior.shape, LookDecoder):
+        if isinstance(trained, TrainedPrior) and isinstance(trained.prior.shape, PrototypeDecoder):
             for prototype in trained.prior.shape.known:
                 if stop.is_set():
                     return

@@ -10,7 +10,7 @@ import io
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Int
@@ -21,15 +21,15 @@ from sceneprior.core.files import write_whole
 from sceneprior.core.parts import Parts
 from sceneprior.core.shards import RoomViews, Shard, iterate_rooms
 from sceneprior.core.wall_lines import Wall, find_walls
-from sceneprior.lifted.lifting.lifted import LiftedBoxes, ShapeGrid
+from sceneprior.lifted.lifting import LiftedBoxes, ShapeGrid
 
 VERSION = 2
 """Version of the cached boxes."""
 SHAPES_VERSION = 5
 """Version of the cached hulls and rays. Increase a version when results change."""
 PARTS_VERSION = 1
-"""Version of the cached parts: increase it when `kinds.py`, `part_fit.py` and what it imports,
-`outlines.py`, `ALIKE` or `HANGS_M` change; delete `lifted_parts_*.npz` while trying settings."""
+"""Version of the cached parts: increase it when `prototype_fitting.py`, `part_fit.py` and what it
+imports, `ALIKE` or `HANGS_M` change; delete `lifted_parts_*.npz` while trying settings."""
 WALLS_VERSION = 1
 """Version of the cached walls."""
 
@@ -52,29 +52,24 @@ class LiftedCache(NamedTuple):
         """Boxes of each room, which has `counts` objects."""
 
         def find() -> dict[str, np.ndarray]:
-            # Imported only where something is lifted, here and below: Numba is slow to import.
             from sceneprior.lifted.lifting.boxes import lift_boxes
 
-            found = [
+            return _joined(
                 lift_boxes(shard.read_room(room_id, images=True), views)
                 for views, shard, room_id in self._rooms("lifting boxes from masks (rooms)")
-            ]
-            return {
-                name: np.concatenate([getattr(room, name) for room in found])
-                for name in LiftedBoxes._fields
-            }
+            )
 
-        saved = _kept(self.folder / f"lifted_{self.split}.npz", self.key, find)
-        parts = [np.split(saved[name], np.cumsum(counts)[:-1]) for name in LiftedBoxes._fields]
-        return [LiftedBoxes(*each) for each in zip(*parts, strict=True)]
+        saved = self._kept("lifted", self.key, find)
+        rooms = [np.split(saved[name], np.cumsum(counts)[:-1]) for name in LiftedBoxes._fields]
+        return [LiftedBoxes(*each) for each in zip(*rooms, strict=True)]
 
     def shapes(self, boxes: Sequence[LiftedBoxes], grid: ShapeGrid) -> dict[str, np.ndarray]:
         """Visual hulls (`bits`), packed to eight cells per byte, and the fields of a `RayPool`, of
         all objects, whose boxes are given by room."""
 
         def find() -> dict[str, np.ndarray]:
-            from sceneprior.lifted.lifting.rays import draw_rays
-            from sceneprior.lifted.lifting.shapes import lift_shapes
+            from sceneprior.lifted.lifting.boxes import draw_rays
+            from sceneprior.lifted.lifting.hulls import lift_shapes
 
             hulls, rays = [], []
             for its_boxes, (views, shard, room_id) in zip(
@@ -83,16 +78,11 @@ class LiftedCache(NamedTuple):
                 room = shard.read_room(room_id, images=True)
                 hulls.append(lift_shapes(room, its_boxes, grid, views))
                 rays.append(draw_rays(room, its_boxes, RAYS_KEPT, grid.margin, views))
-            grids = np.concatenate(hulls)
-            starts, spans, hits = (np.concatenate(part) for part in zip(*rays, strict=True))
-            return {
-                "bits": np.packbits(grids.reshape(len(grids), -1), axis=1),
-                "starts": starts.astype(np.float16),
-                "spans": spans.astype(np.float16),
-                "hits": hits,
-            }
+            grids, found = np.concatenate(hulls), _joined(rays)
+            found |= {name: found[name].astype(np.float16) for name in ("starts", "spans")}
+            return found | {"bits": np.packbits(grids.reshape(len(grids), -1), axis=1)}
 
-        return _kept(self.folder / f"lifted_shapes_{self.split}.npz", self._shapes_key(grid), find)
+        return self._kept("lifted_shapes", self._shapes_key(grid), find)
 
     def parts(
         self,
@@ -104,13 +94,12 @@ class LiftedCache(NamedTuple):
 
         def find() -> dict[str, np.ndarray]:
             found = fit()
-            columns = zip(Parts._fields, zip(*found, strict=True), strict=True)
             counts = np.array([(len(each.kind), len(each.outline)) for each in found])
-            return {name: np.concatenate(column) for name, column in columns} | {"counts": counts}
+            return _joined(found) | {"counts": counts}
 
         chosen = hashlib.sha256(items.tobytes()).hexdigest()
         key = f"{self._shapes_key(grid)} {PARTS_VERSION} {chosen}"
-        saved = _kept(self.folder / f"lifted_parts_{self.split}.npz", key, find)
+        saved = self._kept("lifted_parts", key, find)
         solids, corners = np.cumsum(saved["counts"], axis=0)[:-1].T
         columns = [
             np.split(saved[name], corners if name == "outline" else solids)
@@ -134,11 +123,10 @@ class LiftedCache(NamedTuple):
                 "counts": np.array([len(walls) for walls in found]),
             }
 
-        key = f"{self.key} {WALLS_VERSION}"
-        saved = _kept(self.folder / f"lifted_walls_{self.split}.npz", key, find)
-        parts = np.split(saved["walls"], np.cumsum(saved["counts"])[:-1])
+        saved = self._kept("lifted_walls", f"{self.key} {WALLS_VERSION}", find)
         return [
-            [Wall(row[:2], row[2:4], row[4:6], float(row[6])) for row in part] for part in parts
+            [Wall(row[:2], row[2:4], row[4:6], float(row[6])) for row in part]
+            for part in np.split(saved["walls"], np.cumsum(saved["counts"])[:-1])
         ]
 
     def _shapes_key(self, grid: ShapeGrid) -> str:
@@ -151,23 +139,25 @@ class LiftedCache(NamedTuple):
         for views, (shard, room_id) in zip(progress, rooms, strict=True):
             yield views, shard, room_id
 
-
-def _kept(path: Path, key: str, find: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Read the arrays cached in a file under this key. If they are missing, compute them, and cache
-    them if the file is writable."""
-    try:
-        with np.load(path) as saved:
-            if str(saved["key"]) == key:
-                return {name: saved[name] for name in saved.files}
-    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile):
-        pass  # missing or damaged: computed again
-    found = find()
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, key=np.array(key), **found)
-    if path.parent.is_dir():  # no folder is created
-        with contextlib.suppress(OSError):  # a read-only folder gets no cache
-            write_whole(path, buffer.getvalue())
-    return found
+    def _kept(
+        self, name: str, key: str, find: Callable[[], dict[str, np.ndarray]]
+    ) -> dict[str, np.ndarray]:
+        """Read the arrays cached in a file under this key. If they are missing, compute them, and
+        cache them if the file is writable."""
+        path = self.folder / f"{name}_{self.split}.npz"
+        try:
+            with np.load(path) as saved:
+                if str(saved["key"]) == key:
+                    return {name: saved[name] for name in saved.files}
+        except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile):
+            pass  # missing or damaged: computed again
+        found = find()
+        buffer = io.BytesIO()
+        np.savez(buffer, allow_pickle=False, key=np.array(key), **found)
+        if path.parent.is_dir():  # no folder is created
+            with contextlib.suppress(OSError):  # a read-only folder gets no cache
+                write_whole(path, buffer.getvalue())
+        return found
 
 
 def fingerprint(
@@ -184,3 +174,12 @@ def fingerprint(
         ):  # fmt: skip
             summary.update(np.ascontiguousarray(array).data)
     return summary.hexdigest()
+
+
+def _joined(items: Any) -> dict[str, np.ndarray]:
+    """The fields of named tuples of arrays, each concatenated."""
+    items = list(items)
+    columns = zip(*items, strict=True)
+    return {
+        name: np.concatenate(column) for name, column in zip(items[0]._fields, columns, strict=True)
+    }

@@ -1,12 +1,14 @@
 """The rooms of a split with their lifted boxes and shapes, in memory, for training in 3D."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from sceneprior.core.classes import VOID
 from sceneprior.core.data.dataset import BLANK, RoomDataset, allowed_views
@@ -16,17 +18,16 @@ from sceneprior.core.parts import filled_cells
 from sceneprior.core.shards import RoomViews, Shard
 from sceneprior.core.views import LiftedRooms
 from sceneprior.core.wall_lines import Wall
+from sceneprior.lifted.lifting import HANGS_M, RayPool, ShapeGrid
 from sceneprior.lifted.lifting.cache import LiftedCache, fingerprint
-from sceneprior.lifted.lifting.lifted import HANGS_M, RayPool, ShapeGrid
-from sceneprior.lifted.prototypes import Prototypes, choose_prototypes, turned_looks
+from sceneprior.lifted.prototypes import Prototypes, choose_prototypes, turn_posed
 
 
 class LiftedDataset(RoomDataset):
     """Tracked objects of a split with the 3D boxes estimated from their masks; rows and turns are
     those of `ViewDataset`.
 
-    Boxes are computed once and cached beside the shards (`LiftedCache`); visual hulls, rays and
-    parts likewise, if `shape` gives the hulls' grid.
+    Visual hulls, rays and parts are lifted as well if `shape` gives the hulls' grid.
     `view_fraction` and `seed` are those of `ViewDataset`. If no object is visible in two views, a
     `ShardError` says so.
     """
@@ -55,17 +56,10 @@ class LiftedDataset(RoomDataset):
             allowed_views(seed, index, len(room.visible), view_fraction)
             for index, room in enumerate(rooms)
         ]
-        key = fingerprint(rooms, checksums, chosen)
-        self._cache = LiftedCache(folder, split, chosen, key)
+        self._cache = LiftedCache(folder, split, chosen, fingerprint(rooms, checksums, chosen))
         counts = [len(room.object_class) for room in rooms]
         self.boxes = self._cache.boxes(counts)
         self.max_objects = max(counts)
-        self._counts = torch.tensor(counts)
-        self._classes = _padded([room.object_class.astype(np.int64) for room in rooms])
-        self._lifted = _padded([boxes.explained > 0 for boxes in self.boxes])
-        self._boxes_m = _padded(
-            [np.hstack([boxes.centers_m, boxes.sizes_m]).astype(np.float32) for boxes in self.boxes]
-        )
         self.object_classes = np.concatenate([room.object_class for room in rooms]).astype(np.int64)
         """Classes of all objects, room after room."""
         if not self.usable.any():
@@ -76,8 +70,15 @@ class LiftedDataset(RoomDataset):
                 f"and high, in at least two views of a room, and here are {views} views (at "
                 f"data.view_fraction {view_fraction:g}). Prepare more or larger views of each room."
             )
-        self._looks: Tensor | None = None
-        """Looks by room and quarter turn."""
+        self._rooms = LiftedRooms(
+            room_index=torch.arange(len(rooms)),
+            object_class=_padded([room.object_class.astype(np.int64) for room in rooms]),
+            is_object=_padded([np.ones(count, dtype=bool) for count in counts]),
+            is_lifted=_padded([boxes.explained > 0 for boxes in self.boxes]),
+            boxes_m=_padded(
+                [np.hstack([b.centers_m, b.sizes_m]).astype(np.float32) for b in self.boxes]
+            ),
+        )
         self._shape = shape
         if shape is not None:
             found = self._cache.shapes(self.boxes, shape)
@@ -100,7 +101,7 @@ class LiftedDataset(RoomDataset):
     def find_prototypes(self, most: int) -> Prototypes:
         """Choose at most `most` prototypes, made of parts, that represent all usable objects."""
         # Imported only where something is lifted, here and below, since Numba is slow to import.
-        from sceneprior.lifted.lifting.kinds import fit_kinds
+        from sceneprior.lifted.lifting.prototype_fitting import fit_prototypes
 
         assert self._shape is not None, "opened with shapes"
         hulls, sizes_m, labels = self.hulls(), self.sizes_m, self.object_classes
@@ -113,35 +114,32 @@ class LiftedDataset(RoomDataset):
         parts = self._cache.parts(
             items,
             self._shape,
-            lambda: fit_kinds(items, hulls, self.rays, sizes_m, labels, self.usable, hangs, margin),
+            lambda: fit_prototypes(
+                items, hulls, self.rays, sizes_m, labels, self.usable, hangs, margin
+            ),
         )
         grids = [filled_cells(each, self._shape.cells, margin) for each in parts]
         return Prototypes(parts, np.stack(grids), sizes_m[items], labels[items], common)
 
-    def looks_of(self, prototypes: Prototypes) -> Int[np.ndarray, " objects"]:
+    def posed_prototypes(self, prototypes: Prototypes) -> Int[np.ndarray, " objects"]:
         """The look of each object; -1 if it is not usable or its class has no prototype."""
-        from sceneprior.lifted.lifting.kinds import looks_of
+        from sceneprior.lifted.lifting.prototype_fitting import explain_rays
 
         assert self._shape is not None, "opened with shapes"
         margin = self._shape.margin
-        looks = looks_of(prototypes, self.rays, self.sizes_m, self.object_classes, margin)
+        looks = explain_rays(prototypes, self.rays, self.sizes_m, self.object_classes, margin)
         return np.where(self.usable, looks, -1)
 
-    def see_looks(self, prototypes: Prototypes) -> None:
-        """Assign a look to every object, in every turn of its room; batches have no looks before
-        this.
+    def assign_prototypes(self, prototypes: Prototypes) -> None:
+        """Assign a look to every object; batches have no looks before this.
 
         The prototypes should come from the checkpoint, if there is one: recomputed on another
         processor, they may differ.
         """
-        looks = torch.from_numpy(self.looks_of(prototypes))[None].expand(self.rotations, -1)
-        turned = turned_looks(
-            looks.clamp(min=0), torch.arange(self.rotations), torch.zeros(self.rotations).bool()
-        )
-        turned = turned.where(looks >= 0, -1)
-        parts = turned.T.split(self._counts.tolist())
-        padded = torch.nn.utils.rnn.pad_sequence(list(parts), batch_first=True, padding_value=-1)
-        self._looks = padded.transpose(1, 2).to(self._counts.device)
+        counts = self._rooms.is_object.sum(dim=1).tolist()
+        looks = torch.from_numpy(self.posed_prototypes(prototypes)).split(counts)
+        padded = pad_sequence(list(looks), batch_first=True, padding_value=-1)
+        self._rooms = replace(self._rooms, looks=padded.to(self._rooms.is_object.device))
 
     def walls(self) -> list[list[Wall]]:
         """Walls of each room, found in its masks; none if its shard has no stuff."""
@@ -156,32 +154,34 @@ class LiftedDataset(RoomDataset):
 
     def to(self, device: torch.device | str) -> "LiftedDataset":
         """Move all boxes and looks to `device`, on which batches are then assembled."""
-        self._counts, self._classes = self._counts.to(device), self._classes.to(device)
-        self._lifted, self._boxes_m = self._lifted.to(device), self._boxes_m.to(device)
-        self._looks = None if self._looks is None else self._looks.to(device)
+        self._rooms = self._rooms.to(device)
         return self
 
     def __getitems__(self, draws: list[tuple[int, int]]) -> LiftedRooms:
         """A batch of rows; each draw is (row, epoch). A draw of epoch `BLANK` is an empty room;
         other epochs are ignored."""
-        device = self._counts.device
+        device = self._rooms.is_object.device
         rows = torch.tensor([row for row, _ in draws], device=device)
         shown = torch.tensor([epoch != BLANK for _, epoch in draws], device=device)
-        rooms, quarters = rows // self.rotations, rows % self.rotations
-        counts = self._counts[rooms] * shown
-        widest = max(int(counts.max()), 1)
-        is_object = torch.arange(widest, device=device) < counts[:, None]
+        quarters = rows % self.rotations
+        batch = self._rooms.changed(lambda part: part[rows // self.rotations])
+        is_object = batch.is_object & shown[:, None]
+        widest = max(int(is_object.sum(dim=1).max()), 1)
+        looks = batch.looks
+        if looks is not None:
+            turned = turn_posed(looks.clamp(min=0), quarters, torch.zeros_like(shown))
+            looks = turned.where(looks >= 0, -1)[:, :widest]
         return LiftedRooms(
             room_index=rows,
-            object_class=self._classes[rooms, :widest] * is_object,
-            is_object=is_object,
-            is_lifted=self._lifted[rooms, :widest] & is_object,
-            boxes_m=turn_boxes(self._boxes_m[rooms, :widest], quarters),
-            looks=None if self._looks is None else self._looks[rooms, quarters, :widest],
-            room_ids=tuple(self.plain_ids[room] for room in rooms.tolist()),
+            object_class=(batch.object_class * is_object)[:, :widest],
+            is_object=is_object[:, :widest],
+            is_lifted=(batch.is_lifted & is_object)[:, :widest],
+            boxes_m=turn_boxes(batch.boxes_m, quarters)[:, :widest],
+            looks=looks,
+            room_ids=tuple(self.plain_ids[row // self.rotations] for row, _ in draws),
         )
 
 
 def _padded(parts: Sequence[np.ndarray]) -> Tensor:
     """Per-room arrays of objects, padded to one tensor."""
-    return torch.nn.utils.rnn.pad_sequence([torch.from_numpy(a) for a in parts], batch_first=True)
+    return pad_sequence([torch.from_numpy(part) for part in parts], batch_first=True)

@@ -8,10 +8,11 @@ the smallest box in it that still explains every mask.
 from typing import NamedTuple, no_type_check
 
 import numpy as np
-from jaxtyping import Float, Int, Integer
+from jaxtyping import Bool, Float, Int, Integer
 from numba import njit
 
 from sceneprior.core.shards import RoomViews
+from sceneprior.lifted.lifting import LiftedBoxes, ShapeGrid
 from sceneprior.render.silhouettes.cpu.threads import in_threads
 
 MOST_EMPTY = 0.35
@@ -22,6 +23,11 @@ NEVER = 2.0
 object there."""
 MIN_DEPTH_M = 0.1
 """Depth below which a cell is not projected into a view."""
+REACH = 0.4
+"""`reach` of `hulls.carve`, in cells: parts of this thickness are kept."""
+EMPTY = 0.05
+"""Threshold: a cell counts as empty if a larger share of the views sees past it. The threshold in
+`boxes.py` is higher, because there one wrong cell can move a whole side of a box."""
 
 
 class Sightings(NamedTuple):
@@ -50,7 +56,7 @@ class Hull(NamedTuple):
     emptiness: Float[np.ndarray, "x y z"]
     """Share of the views with evidence about a cell that see past it, after half a view is
     subtracted from these; `NEVER` for a cell that `carve` rules out. The hull consists of the cells
-    up to a threshold, which `boxes.py` and `shapes.py` choose, since masks have errors."""
+    up to a threshold, which `boxes.py` and `lift_shapes` choose, since masks have errors."""
 
     @property
     def cell_m(self) -> Float[np.ndarray, "3"]:
@@ -100,6 +106,31 @@ def carve(
         seen.world_to_image, seen.focal_px, low_m, high_m, reach, most_empty, emptiness,
     )  # fmt: skip
     return Hull(low_m, high_m, emptiness)
+
+
+def lift_shapes(
+    views: RoomViews,
+    boxes: LiftedBoxes,
+    shape: ShapeGrid,
+    chosen: Int[np.ndarray, " views"] | None = None,
+) -> Bool[np.ndarray, "objects x y z"]:
+    """The visual hull of each of a room's objects, on a grid in the frame of its box.
+
+    True in cells that the object may fill, never outside the box; all False for an object without
+    a box. `views` and `chosen` are those of `lift_boxes`.
+    """
+    rows = np.arange(len(views.visible)) if chosen is None else chosen
+    cells, margin = shape.cells, shape.margin
+    grids = np.zeros((len(views.object_class), cells, cells, cells), dtype=bool)
+    # Cells whose centres lie in the box.
+    inside = np.abs((np.arange(cells) + 0.5) / cells - 0.5) * margin < 0.5
+    for item in np.flatnonzero(boxes.explained > 0):
+        seen = sightings_of(views, rows[views.visible[rows, item]], int(item))
+        half_m = margin * boxes.sizes_m[item] / 2
+        low_m, high_m = boxes.centers_m[item] - half_m, boxes.centers_m[item] + half_m
+        hull = carve(seen, low_m, high_m, cells, REACH, EMPTY)
+        grids[item] = (hull.emptiness <= EMPTY) & inside & inside[:, None] & inside[:, None, None]
+    return grids
 
 
 def cells_along(

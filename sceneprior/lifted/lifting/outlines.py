@@ -20,7 +20,9 @@ def outline_of(hull: Bool[np.ndarray, "x y z"]) -> Float[np.ndarray, "corners 2"
     """Outline of the largest piece of a visual hull seen from above, scaled to touch all four sides
     of the object's box; `SQUARE` if the hull nearly fills the box, or is empty. The hull's grid
     spans the box."""
-    from skimage.measure import find_contours  # imported here, since `looks_of` does not need it
+    from skimage.measure import (
+        find_contours,  # imported here, since `explain_rays` does not need it
+    )
 
     seen = np.pad(hull.any(axis=1), 1).astype(np.float64)
     found = [shapely.Polygon(line) for line in find_contours(seen, 0.5) if len(line) > 3]

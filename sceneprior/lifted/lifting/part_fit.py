@@ -21,11 +21,11 @@ from sceneprior.core.parts import (
     MOST_PARTS,
     Parts,
 )
-from sceneprior.lifted.lifting.lifted import RayPool
+from sceneprior.lifted.lifting import RayPool
 from sceneprior.lifted.lifting.outlines import outline_of
 from sceneprior.lifted.lifting.part_loss import Change, Guess, RayFit
-from sceneprior.lifted.lifting.part_mends import closed, faults_of, lowered, supports, whole
-from sceneprior.lifted.lifting.part_prices import LEVELS
+from sceneprior.lifted.lifting.part_regularizers import LEVELS
+from sceneprior.lifted.lifting.part_repair import closed, faults_of, lowered, supports, whole
 
 CURVED = (CYLINDER, ELLIPSOID, DOME, BOWL)
 LEAST_GAIN = 1e-4
@@ -80,16 +80,16 @@ def _one_more(
         if all(
             kind == BOX for kind, _, _ in change.values()
         ):  # curved parts take ten times as long
-            trial = some.settled(trial, change, 1)
+            trial = some.refined(trial, change, 1)
         parts = zip(trial.kinds.tolist(), trial.mirrored.tolist(), trial.ends, strict=True)
-        settled = {row: part for row, part in enumerate(parts) if row in change}
-        tried.append((some.loss(trial), settled))
+        refined = {row: part for row, part in enumerate(parts) if row in change}
+        tried.append((some.loss(trial), refined))
     best, least = None, every.loss(guess) - LEAST_GAIN
     for _, change in sorted(tried, key=lambda each: each[0])[:FINALISTS]:
-        trial = every.settled(every.changed(guess, change), change, 2)
+        trial = every.refined(every.changed(guess, change), change, 2)
         if (loss := every.loss(trial)) < least:
             best, least = trial, loss
-    return best and every.settled(best, range(len(best.kinds)), 2)
+    return best and every.refined(best, range(len(best.kinds)), 2)
 
 
 def _changes(

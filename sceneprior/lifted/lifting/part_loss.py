@@ -28,16 +28,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sceneprior.core.parts import BOX, SQUARE, Parts
-from sceneprior.lifted.lifting.lifted import RayPool
+from sceneprior.lifted.lifting import RayPool
 from sceneprior.lifted.lifting.outlines import area_table, cut_rays, points_within
-from sceneprior.lifted.lifting.part_prices import (
+from sceneprior.lifted.lifting.part_rays import descend, meets, wrong_rays
+from sceneprior.lifted.lifting.part_regularizers import (
     LEVELS,
     count_planes,
     gap_and_pieces,
     overhang,
     volume_of,
 )
-from sceneprior.lifted.lifting.part_rays import descend, meets, wrong_rays
 
 PART_PRICE, CURVED_PRICE, PLANE_PRICE = 0.002, 0.002, 0.002
 VOLUME_PRICE, GAP_PRICE, PIECE_PRICE, OVERHANG_PRICE = -0.0005, 0.06, 0.005, 0.1
@@ -57,7 +57,7 @@ class Guess(NamedTuple):
     kinds: Int[np.ndarray, " parts"]
     mirrored: Int[np.ndarray, " parts"]
     ends: Int[np.ndarray, "parts 3 2"]
-    """Lower and upper end along each axis, in levels (`part_prices.py`)."""
+    """Lower and upper end along each axis, in levels (`part_regularizers.py`)."""
     covered: Bool[np.ndarray, "parts rays"]
     """True if the part meets the ray."""
     met_by: Int[np.ndarray, " rays"]
@@ -157,7 +157,7 @@ class RayFit:
         kinds, mirrored, ends, covered = (part[others] for part in guess[:4])
         return Guess(kinds, mirrored, ends, covered, guess.met_by - guess.covered[row])
 
-    def settled(self, guess: Guess, rows: Iterable[int], sweeps: int) -> Guess:
+    def refined(self, guess: Guess, rows: Iterable[int], sweeps: int) -> Guess:
         """The guess after coordinate descent of the faces of some parts (`descend`), or the guess
         itself if its loss is lower: the descent ignores gaps and pieces."""
         moved = Guess(*(part.copy() for part in guess))

@@ -11,7 +11,7 @@ from numba import njit
 
 from sceneprior.core.parts import ACROSS_X, ACROSS_Z, BOWL, BOX, CYLINDER, DOME
 from sceneprior.lifted.lifting.outlines import within
-from sceneprior.lifted.lifting.part_prices import LEVELS, planes_of, volume_of
+from sceneprior.lifted.lifting.part_regularizers import LEVELS, planes_of, volume_of
 
 FAR = 1e6
 """A level beyond all rays."""

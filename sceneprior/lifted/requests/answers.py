@@ -12,11 +12,11 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Opening, Scene
 from sceneprior.core.seeds import check_seed
 from sceneprior.core.threads import single_threaded
+from sceneprior.lifted.config import TrainedLifted
 from sceneprior.lifted.requests.draw import Answer, draw_requested
 from sceneprior.lifted.requests.relation_checks import RelationChecks, furniture_in
 from sceneprior.lifted.requests.request import Request, make_request
 from sceneprior.lifted.sampled import drawn_by_sampler, scene_of
-from sceneprior.lifted.trained import TrainedLifted
 from sceneprior.paper.prior import TrainedPrior
 from sceneprior.paper.sampling import scene_names
 

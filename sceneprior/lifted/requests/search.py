@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sceneprior.core.geometry.turns import QUARTERS
 from sceneprior.core.mixtures import draw_index
-from sceneprior.lifted.prototypes import turned_looks
+from sceneprior.lifted.prototypes import turn_posed
 from sceneprior.lifted.requests.placement_rules import PlacementRules
 from sceneprior.lifted.requests.relation_checks import Furniture, furniture_of
 from sceneprior.lifted.sampler.network import RoomSampler
@@ -57,7 +57,7 @@ def search(
         upcoming: Classes of objects that are placed later.
     """
     quarters = torch.from_numpy(draws.integers(QUARTERS, size=CANDIDATES))
-    looks = turned_looks(
+    looks = turn_posed(
         torch.full((CANDIDATES, 1), item.look), quarters, torch.zeros(CANDIDATES, dtype=torch.bool)
     )[:, 0]
     turned = (quarters % 2 == 1)[:, None]

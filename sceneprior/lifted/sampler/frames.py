@@ -13,7 +13,7 @@ from torch import Tensor
 
 from sceneprior.core.geometry.turns import QUARTERS, turn_boxes
 from sceneprior.core.views import RoomBoxes
-from sceneprior.lifted.prototypes import POSES, turned_looks
+from sceneprior.lifted.prototypes import POSES, turn_posed
 from sceneprior.lifted.sampler.rooms import gaps_to_sides_m, own_sides, rectangles_of
 
 FURTHEST_M = 1.0
@@ -38,7 +38,7 @@ def into_frames(rooms: RoomBoxes, back: Int[Tensor, " rooms"]) -> RoomBoxes:
     return replace(
         rooms,
         boxes_m=turn_boxes(rooms.boxes_m, quarters),
-        looks=turned_looks(rooms.looks, quarters, torch.zeros_like(quarters, dtype=torch.bool)),
+        looks=turn_posed(rooms.looks, quarters, torch.zeros_like(quarters, dtype=torch.bool)),
     )
 
 

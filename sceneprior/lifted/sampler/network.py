@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from sceneprior.core.geometry.turns import QUARTERS
 from sceneprior.core.mixtures import LogisticMixture, draw_index
 from sceneprior.core.views import RoomBoxes
-from sceneprior.lifted.prototypes import POSES, turned_looks
+from sceneprior.lifted.prototypes import POSES, turn_posed
 from sceneprior.lifted.sampler.contents import Contents
 from sceneprior.lifted.sampler.look_scores import LookScores
 from sceneprior.lifted.sampler.placement import SHOWN, Placement
@@ -33,7 +33,7 @@ MATCH_WIDTH = 64
 
 def _own_pose() -> Int[Tensor, "symmetries poses"]:
     symmetry, own = torch.arange(SYMMETRIES), torch.arange(POSES).expand(SYMMETRIES, -1)
-    return turned_looks(own, symmetry % QUARTERS, symmetry >= QUARTERS).argsort(dim=1)
+    return turn_posed(own, symmetry % QUARTERS, symmetry >= QUARTERS).argsort(dim=1)
 
 
 OWN_POSE = _own_pose()

@@ -14,7 +14,7 @@ from sceneprior.core.geometry.turns import QUARTERS, turn_boxes
 from sceneprior.core.views import RoomBoxes
 from sceneprior.core.wall_lines import Wall
 from sceneprior.lifted.lifting.dataset import LiftedDataset
-from sceneprior.lifted.prototypes import POSES, Prototypes, turned_looks
+from sceneprior.lifted.prototypes import POSES, Prototypes, turn_posed
 
 GRAZE_M = 0.05
 """Overlap along an axis up to which an intersection of lifted boxes is attributed to their
@@ -60,7 +60,7 @@ class SamplerRooms:
         self.prototypes: Prototypes
         self.rooms: RoomBoxes
 
-    def see_looks(self, prototypes: Prototypes) -> "SamplerRooms":
+    def assign_prototypes(self, prototypes: Prototypes) -> "SamplerRooms":
         """Set `rooms`, in which every object has a look, and return this data set.
 
         Only common prototypes are used, since rare prototypes are often errors of lifting.
@@ -68,7 +68,7 @@ class SamplerRooms:
         lifted, prototypes = self._lifted, prototypes.common_alone()
         counts = [len(room.explained) for room in lifted.boxes]
         boxes_m = np.concatenate([np.hstack([b.centers_m, b.sizes_m]) for b in lifted.boxes])
-        looks = lifted.looks_of(prototypes)
+        looks = lifted.posed_prototypes(prototypes)
         rows = np.split(np.arange(len(looks)), np.cumsum(counts)[:-1])
         kept = [torch.from_numpy(row[looks[row] >= 0]) for row in rows]
 
@@ -224,7 +224,7 @@ def turned_rooms(rooms: RoomBoxes, symmetry: Int[Tensor, " rooms"]) -> RoomBoxes
     return replace(
         rooms,
         boxes_m=turn_boxes(rooms.boxes_m, quarters, mirrored),
-        looks=turned_looks(rooms.looks, quarters, mirrored),
+        looks=turn_posed(rooms.looks, quarters, mirrored),
         walls_m=None
         if rooms.walls_m is None
         else torch.zeros_like(rooms.walls_m).scatter(-1, own_sides(symmetry), rooms.walls_m),

@@ -18,11 +18,10 @@ from sceneprior.core.geometry.turns import turn_boxes, turn_grids
 from sceneprior.core.parts import whole_box
 from sceneprior.core.shards import iterate_rooms
 from sceneprior.core.wall_lines import find_walls
-from sceneprior.lifted.lifting import boxes, cache, kinds, shapes
+from sceneprior.lifted.lifting import RayPool, ShapeGrid, boxes, cache, hulls, prototype_fitting
+from sceneprior.lifted.lifting.boxes import draw_rays
 from sceneprior.lifted.lifting.dataset import LiftedDataset
-from sceneprior.lifted.lifting.kinds import looks_of
-from sceneprior.lifted.lifting.lifted import RayPool, ShapeGrid
-from sceneprior.lifted.lifting.rays import draw_rays
+from sceneprior.lifted.lifting.prototype_fitting import explain_rays
 from sceneprior.lifted.prototypes import POSES, turn_of
 
 GRID = ShapeGrid(cells=8, margin=1.2)
@@ -59,7 +58,7 @@ def test_turned_rows_are_turned_rooms(shards):
     data = LiftedDataset(shards, "train", rotations=4, shape=GRID)
     prototypes = data.find_prototypes(99)
     odd = np.random.default_rng(0).random((1, 8, 8, 8))  # another grid in every pose
-    data.see_looks(prototypes)
+    data.assign_prototypes(prototypes)
     plain, turned = data.__getitems__([(4, 0)]), data.__getitems__([(7, 2)])
     assert torch.equal(turned.boxes_m, turn_boxes(plain.boxes_m, torch.tensor([3])))
     for item in range(int(plain.is_object.sum())):
@@ -73,7 +72,7 @@ def test_looks_are_those_of_the_rays_in_the_order_of_objects(shards):
     data = LiftedDataset(shards, "train", shape=GRID)
     assert data.__getitems__([(1, 0)]).looks is None, "not before there are prototypes"
     prototypes = data.find_prototypes(99)
-    data.see_looks(prototypes)
+    data.assign_prototypes(prototypes)
     batch = data.__getitems__([(1, 0), (3, 0)])
     for row, (shard, room_id) in enumerate(iterate_rooms(shards, "train")):
         if row in (1, 3):
@@ -83,7 +82,7 @@ def test_looks_are_those_of_the_rays_in_the_order_of_objects(shards):
             known = (data.boxes[row].explained > 0) & (room.object_class != VOID)
             sizes_m = np.where(known[:, None], data.boxes[row].sizes_m, 1)
             labels = room.object_class.astype(np.int64)
-            wanted = looks_of(prototypes, rays, sizes_m, labels, GRID.margin)
+            wanted = explain_rays(prototypes, rays, sizes_m, labels, GRID.margin)
             found = batch.looks[(row - 1) // 2, : len(labels)].numpy()
             np.testing.assert_array_equal(found, np.where(known, wanted, -1))
             assert (found >= 0).any()
@@ -95,8 +94,8 @@ def test_what_has_no_label_or_no_box_has_no_look(shards):
     data.object_classes[0] = VOID
     data.boxes[0].explained[1] = 0
     assert data.usable.tolist()[:3] == [False, False, True]
-    assert data.looks_of(prototypes).tolist()[:2] == [-1, -1]
-    data.see_looks(prototypes)
+    assert data.posed_prototypes(prototypes).tolist()[:2] == [-1, -1]
+    data.assign_prototypes(prototypes)
     assert data.__getitems__([(0, 0)]).looks[0, :2].tolist() == [-1, -1]
 
 
@@ -108,8 +107,8 @@ def test_a_blank_draw_is_a_room_in_which_there_is_nothing(shards):
 def test_shapes_are_found_once_and_again_on_other_grids(shards, monkeypatch):
     LiftedDataset(shards, "train", shape=GRID)
     calls = []
-    find = shapes.lift_shapes
-    monkeypatch.setattr(shapes, "lift_shapes", lambda *given: calls.append(1) or find(*given))
+    find = hulls.lift_shapes
+    monkeypatch.setattr(hulls, "lift_shapes", lambda *given: calls.append(1) or find(*given))
     LiftedDataset(shards, "train", shape=GRID)
     assert calls == []
     LiftedDataset(shards, "train", shape=GRID._replace(margin=1.3))
@@ -118,8 +117,10 @@ def test_shapes_are_found_once_and_again_on_other_grids(shards, monkeypatch):
 
 def test_parts_are_found_once_and_again_for_other_prototypes(shards, monkeypatch):
     (shards / "lifted_parts_train.npz").unlink(missing_ok=True)
-    fitted, fit = [], kinds.fit_kinds
-    monkeypatch.setattr(kinds, "fit_kinds", lambda *given: fitted.append(fit(*given)) or fitted[-1])
+    fitted, fit = [], prototype_fitting.fit_prototypes
+    monkeypatch.setattr(
+        prototype_fitting, "fit_prototypes", lambda *given: fitted.append(fit(*given)) or fitted[-1]
+    )
     first = LiftedDataset(shards, "train", shape=GRID).find_prototypes(99)
     data = LiftedDataset(shards, "train", shape=GRID)
     again = data.find_prototypes(99)

@@ -15,13 +15,13 @@ from sceneprior.core.parts import (
     Parts,
     filled_cells,
 )
-from sceneprior.lifted.lifting.lifted import RayPool
+from sceneprior.lifted.lifting import RayPool
 from sceneprior.lifted.lifting.outlines import area_table
 from sceneprior.lifted.lifting.part_fit import fit_parts
 from sceneprior.lifted.lifting.part_loss import RayFit
-from sceneprior.lifted.lifting.part_mends import closed as without_slits
-from sceneprior.lifted.lifting.part_mends import supports
-from sceneprior.lifted.lifting.part_prices import gap_and_pieces, overhang
+from sceneprior.lifted.lifting.part_regularizers import gap_and_pieces, overhang
+from sceneprior.lifted.lifting.part_repair import closed as without_slits
+from sceneprior.lifted.lifting.part_repair import supports
 
 MARGIN, CELLS = 1.1, 32
 

@@ -7,7 +7,8 @@ from parts_of_rooms import TABLE, rays_of
 from sceneprior.core.parts import ACROSS_X, ACROSS_Z, BOX, SQUARE, Parts, inside
 from sceneprior.lifted.lifting.outlines import area_table
 from sceneprior.lifted.lifting.part_loss import RayFit
-from sceneprior.lifted.lifting.part_prices import (
+from sceneprior.lifted.lifting.part_rays import count_wrong, descend, meets
+from sceneprior.lifted.lifting.part_regularizers import (
     LEVELS,
     count_planes,
     gap_and_pieces,
@@ -15,7 +16,6 @@ from sceneprior.lifted.lifting.part_prices import (
     planes_of,
     volume_of,
 )
-from sceneprior.lifted.lifting.part_rays import count_wrong, descend, meets
 
 MARGIN = 1.1
 EVERYWHERE = area_table(SQUARE, LEVELS)
@@ -83,7 +83,7 @@ def test_moving_faces_never_makes_more_rays_wrong_and_keeps_the_counts():
         ends = np.stack([low, low + rng.integers(2, 30, (3, 3))], axis=2)
         kinds, mirrored = rng.integers(0, 5, 3), rng.integers(0, 4, 3)
         guess = fit.guess(kinds, mirrored, ends)
-        moved = fit.settled(guess, range(3), 2)
+        moved = fit.refined(guess, range(3), 2)
         assert fit.loss(moved) <= fit.loss(guess)
         again = fit.guess(*moved[:3])
         assert (again.covered == moved.covered).all() and (again.met_by == moved.met_by).all()

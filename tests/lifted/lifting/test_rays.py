@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from sceneprior.core.shards import iterate_rooms
-from sceneprior.lifted.lifting.boxes import lift_boxes
+from sceneprior.lifted.lifting.boxes import draw_rays, lift_boxes
 from sceneprior.lifted.lifting.hulls import pass_through
-from sceneprior.lifted.lifting.rays import draw_rays
 
 
 @pytest.fixture(scope="module")

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from sceneprior.core.shards import iterate_rooms
+from sceneprior.lifted.lifting import ShapeGrid
 from sceneprior.lifted.lifting.boxes import lift_boxes
-from sceneprior.lifted.lifting.hulls import carve, sightings_of
-from sceneprior.lifted.lifting.lifted import ShapeGrid
-from sceneprior.lifted.lifting.shapes import EMPTY, REACH, lift_shapes
+from sceneprior.lifted.lifting.hulls import EMPTY, REACH, carve, lift_shapes, sightings_of
 
 GRID = ShapeGrid(cells=10, margin=1.25)
 

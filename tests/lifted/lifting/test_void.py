@@ -12,11 +12,10 @@ from sceneprior.core.classes import VOID
 from sceneprior.core.instances.observations import observe
 from sceneprior.core.parts import filled_cells
 from sceneprior.core.scene import Mesh
-from sceneprior.lifted.lifting.boxes import lift_boxes
-from sceneprior.lifted.lifting.lifted import RayPool, ShapeGrid
+from sceneprior.lifted.lifting import RayPool, ShapeGrid
+from sceneprior.lifted.lifting.boxes import draw_rays, lift_boxes
+from sceneprior.lifted.lifting.hulls import lift_shapes
 from sceneprior.lifted.lifting.part_fit import fit_parts
-from sceneprior.lifted.lifting.rays import draw_rays
-from sceneprior.lifted.lifting.shapes import lift_shapes
 from sceneprior.render.offscreen import SoftwareRenderer
 
 GRID = ShapeGrid(cells=24, margin=1.15)

@@ -12,11 +12,20 @@ from sceneprior.apps.reconstruction.own_image import level_camera
 from sceneprior.core.errors import InputError
 from sceneprior.core.geometry.meshes import icosphere
 from sceneprior.core.observed_image import ObservedImage
-from sceneprior.lifted.reconstruction import candidates
-from sceneprior.lifted.reconstruction.candidates import candidates_of, with_shapes
-from sceneprior.lifted.reconstruction.objects import answer_images, likeliest_box
-from sceneprior.lifted.reconstruction.outlines import Outlines, outlines_of, projected_extents
-from sceneprior.lifted.reconstruction.placing import Placed, place_objects
+from sceneprior.lifted.reconstruction import objects as candidates
+from sceneprior.lifted.reconstruction.objects import (
+    answer_images,
+    candidates_of,
+    likeliest_box,
+    with_shapes,
+)
+from sceneprior.lifted.reconstruction.placing import (
+    Outlines,
+    Placed,
+    outlines_of,
+    place_objects,
+    projected_extents,
+)
 
 CUBE = torch.tensor([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 CAMERA = np.array([[48.0, 0, 48], [0, 48, 36], [0, 0, 1]])

@@ -5,7 +5,7 @@ import torch
 from sceneprior.core.geometry.turns import QUARTERS, turn_boxes
 from sceneprior.core.parts import whole_box
 from sceneprior.core.views import RoomBoxes
-from sceneprior.lifted.prototypes import Prototypes, turned_looks
+from sceneprior.lifted.prototypes import Prototypes, turn_posed
 from sceneprior.lifted.sampler.frames import own_sides, side_of
 from sceneprior.lifted.sampler.fronts import _gaps_to_furniture, find_fronts
 from sceneprior.lifted.sampler.rooms import SYMMETRIES, turned_rooms
@@ -91,7 +91,7 @@ def test_sides_follow_a_marker_through_every_pose():
         quarters, mirrored = torch.tensor([pose % 4]), torch.tensor([pose >= 4])
         x, _, z = turn_boxes(marker, quarters, mirrored)[0, 0, :3].tolist()
         side = {(0, -1): 0, (-1, 0): 1, (0, 1): 2, (1, 0): 3}[round(x), round(z)]
-        look = turned_looks(torch.tensor([[8]]), quarters, mirrored)[0]
+        look = turn_posed(torch.tensor([[8]]), quarters, mirrored)[0]
         assert int(look) == 8 + pose
         assert own_sides(look)[0, 1] == side
         assert side_of(look, torch.tensor([0, 1])) == side

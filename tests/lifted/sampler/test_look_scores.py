@@ -8,7 +8,7 @@ from torch.testing import assert_close
 
 from sceneprior.core.geometry.turns import QUARTERS
 from sceneprior.core.views import RoomBoxes
-from sceneprior.lifted.prototypes import POSES, turned_looks
+from sceneprior.lifted.prototypes import POSES, turn_posed
 from sceneprior.lifted.sampler.contents import MANY
 from sceneprior.lifted.sampler.frames import side_of
 from sceneprior.lifted.sampler.look_scores import MOST_LOG, LookScores
@@ -95,7 +95,7 @@ def test_scores_turn_with_the_room(scores, rooms, symmetry):
     by = torch.full((4,), symmetry)
     found = scored(scores, turned_rooms(rooms, by))
     looks = torch.arange(LOOKS).expand(4, -1)
-    at = turned_looks(looks, by % QUARTERS, by >= QUARTERS)
+    at = turn_posed(looks, by % QUARTERS, by >= QUARTERS)
     assert_close(found.gather(1, at), plain, rtol=0, atol=1e-12)
 
 

@@ -10,7 +10,7 @@ from torch.testing import assert_close
 
 from sceneprior.core.geometry.turns import QUARTERS
 from sceneprior.core.views import RoomBoxes
-from sceneprior.lifted.prototypes import turned_looks
+from sceneprior.lifted.prototypes import turn_posed
 from sceneprior.lifted.sampler.contents import END
 from sceneprior.lifted.sampler.likelihood import negative_log_likelihood
 from sceneprior.lifted.sampler.reading import Frame
@@ -117,7 +117,7 @@ def test_how_often_a_look_comes_turns_with_the_room(sampler, rooms):
             shown = torch.tensor([number])
             reading = plain._replace(frame=Frame(frame, shown))
             gain = sampler.look_logits(reading, label) - before
-            at = turned_looks(torch.tensor([[2]]), shown % QUARTERS, shown >= QUARTERS)
+            at = turn_posed(torch.tensor([[2]]), shown % QUARTERS, shown >= QUARTERS)
             likelier = (gain > 1.5) & before.isfinite()
             assert likelier.nonzero()[:, 1].tolist() == at[0].tolist()
     finally:

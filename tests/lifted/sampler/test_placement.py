@@ -7,7 +7,7 @@ from torch.testing import assert_close
 from sceneprior.core.geometry.turns import QUARTERS, turn_boxes
 from sceneprior.core.mixtures import LogisticMixture
 from sceneprior.core.views import RoomBoxes
-from sceneprior.lifted.prototypes import POSES, turned_looks
+from sceneprior.lifted.prototypes import POSES, turn_posed
 from sceneprior.lifted.sampler import places as module
 from sceneprior.lifted.sampler.frames import (
     find_backs,
@@ -70,10 +70,10 @@ def test_places_turn_with_the_room(placement, given, quarters):
     assert rooms.looks is not None
     turned = RoomBoxes(
         rooms.object_class, rooms.is_object, turn_boxes(rooms.boxes_m, by),
-        looks=turned_looks(rooms.looks, by, no),
+        looks=turn_posed(rooms.looks, by, no),
     )  # fmt: skip
     there = distribution(
-        placement, turned, turned_looks(look[:, None], by, no)[:, 0],
+        placement, turned, turn_posed(look[:, None], by, no)[:, 0],
         size_m.flip(-1) if quarters % 2 else size_m, turn_rectangles(rectangle_m, by),
     )  # fmt: skip
     assert_close(there.log_prob(turn_places(place_m, by)), plain, rtol=0, atol=1e-12)
@@ -219,7 +219,7 @@ def test_the_back_is_the_side_at_the_wall():
     assert many.looks is not None
     rooms = RoomBoxes(
         many.object_class, many.is_object, turn_boxes(many.boxes_m, quarters, mirrored),
-        looks=turned_looks(many.looks, quarters, mirrored),
+        looks=turn_posed(many.looks, quarters, mirrored),
     )  # fmt: skip
     backs = find_backs(rooms, 2)
     assert backs.tolist() == [0, 1]  # the rug in the middle is at no side; the first counts

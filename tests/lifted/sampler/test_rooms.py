@@ -35,7 +35,7 @@ def rooms() -> SamplerRooms:
 
 
 def with_looks(lifted: LiftedDataset) -> SamplerRooms:
-    return SamplerRooms(lifted).see_looks(lifted_rooms().find_prototypes(99))
+    return SamplerRooms(lifted).assign_prototypes(lifted_rooms().find_prototypes(99))
 
 
 def test_objects_without_a_label_or_a_box_are_left_out():
@@ -195,7 +195,7 @@ def test_boxes_that_graze_do_not_meet():
 def test_rooms_are_drawn_of_common_prototypes_alone(rooms):
     prototypes = rooms.prototypes._replace(common=np.arange(len(rooms.prototypes.grids)) < 1)
     prototypes = prototypes._replace(object_class=np.abs(prototypes.object_class))
-    seen = sampler_rooms().see_looks(prototypes)
+    seen = sampler_rooms().assign_prototypes(prototypes)
     assert seen.prototypes.object_class.tolist()[1:] == [-1] * (len(prototypes.grids) - 1)
     assert seen.rooms.is_object.any() and (seen.rooms.looks[seen.rooms.is_object] < 8).all()
 

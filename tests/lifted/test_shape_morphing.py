@@ -9,27 +9,27 @@ from parts_of_rooms import CORNER, TABLE
 from sceneprior.core.geometry.part_meshes import Stretch, surface_of_parts
 from sceneprior.core.parts import filled_cells
 from sceneprior.core.views import DecodedScenes
-from sceneprior.lifted.look_paths import posed_parts, shown_looks, stretched_parts
-from sceneprior.lifted.looks import LookConfig, LookDecoder
+from sceneprior.lifted.prototype_decoder import PrototypeConfig, PrototypeDecoder
 from sceneprior.lifted.prototypes import POSES, Prototypes, turned_extents
+from sceneprior.lifted.shape_morphing import appearances_of, posed_parts, stretched_parts
 
 STEPS = 129
 
 
 @pytest.fixture
-def decoder() -> LookDecoder:
+def decoder() -> PrototypeDecoder:
     """Two prototypes, a corner and a table."""
-    decoder = LookConfig(prototypes=2, codes=8, cells=16).build(6)
+    decoder = PrototypeConfig(prototypes=2, codes=8, cells=16).build(6)
     parts = (CORNER, TABLE)
     grids = np.stack([filled_cells(each, 16, 1.1) for each in parts])
     sizes_m = np.array([[2.0, 0.5, 1.0], [1.0, 0.8, 0.6]])
-    decoder.learn_prototypes(Prototypes(parts, grids, sizes_m, np.array([1, 2]), np.ones(2, bool)))
+    decoder.set_prototypes(Prototypes(parts, grids, sizes_m, np.array([1, 2]), np.ones(2, bool)))
     return decoder
 
 
 def test_looks_are_shown_at_the_ends_and_in_the_middle_of_where_they_hold():
     looks = np.repeat([5, 7, 9, 7], [33, 32, 8, 56])
-    (shown,) = shown_looks(looks, np.ones(STEPS, bool))
+    (shown,) = appearances_of(looks, np.ones(STEPS, bool))
     assert shown.looks.tolist() == [5, 7, 7]  # 9 holds for a sixteenth of the path
     np.testing.assert_allclose(shown.places, [0, 48.5 / 128, 1])
     assert shown.at(0.0) == (5, 5, 0.0) or shown.at(0.0) == (5, 7, 0.0)
@@ -41,12 +41,12 @@ def test_an_object_that_comes_and_goes_has_its_own_looks_each_time():
     kept = np.zeros(STEPS, bool)
     kept[[*range(10, 51), *range(90, 129)]] = True
     looks = np.where(np.arange(STEPS) < 30, 1, 2)
-    first, second = shown_looks(looks, kept)
+    first, second = appearances_of(looks, kept)
     assert first.looks.tolist() == [1, 2] and second.looks.tolist() == [2, 2]
     np.testing.assert_allclose(first.places, [10 / 128, 50 / 128])
     assert first.apart(0.0) == 10 / 128 and first.apart(0.2) == 0
-    assert shown_looks(looks, np.zeros(STEPS, bool)) == []
-    (once,) = shown_looks(looks, np.arange(STEPS) == 10)
+    assert appearances_of(looks, np.zeros(STEPS, bool)) == []
+    (once,) = appearances_of(looks, np.arange(STEPS) == 10)
     assert once.at(10 / 128) == (1, 1, 0.0)
 
 

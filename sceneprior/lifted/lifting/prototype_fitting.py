@@ -9,7 +9,7 @@ from rich.progress import track
 
 from sceneprior.core.geometry.turns import quarter_rotation
 from sceneprior.core.parts import Parts
-from sceneprior.lifted.lifting.lifted import RayPool
+from sceneprior.lifted.lifting import RayPool
 from sceneprior.lifted.lifting.part_fit import fit_parts
 from sceneprior.lifted.lifting.part_rays import count_wrong
 from sceneprior.lifted.prototypes import (
@@ -32,10 +32,10 @@ too, as for symmetric objects."""
 ASKED = 128
 """Number of an object's rays from which its look is found."""
 SIZE_WEIGHT = 0.1
-"""Weight of the difference in log extents; see `looks_of`."""
+"""Weight of the difference in log extents; see `explain_rays`."""
 
 
-def fit_kinds(
+def fit_prototypes(
     items: Int[np.ndarray, " prototypes"],
     hulls: Bool[np.ndarray, "objects x y z"],
     rays: RayPool,
@@ -87,7 +87,7 @@ def as_prototype(rays: RayPool, pose: int) -> RayPool:
     return RayPool(starts, spans, rays.hits)
 
 
-def looks_of(
+def explain_rays(
     prototypes: Prototypes,
     rays: RayPool,
     sizes_m: Float[np.ndarray, "objects 3"],

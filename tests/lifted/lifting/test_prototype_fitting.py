@@ -6,8 +6,8 @@ from parts_of_rooms import CORNER, TABLE, rays_of
 
 from sceneprior.core.geometry.turns import turn_grids
 from sceneprior.core.parts import filled_cells
-from sceneprior.lifted.lifting.kinds import as_prototype, fit_kinds, looks_of
-from sceneprior.lifted.lifting.lifted import RayPool
+from sceneprior.lifted.lifting import RayPool
+from sceneprior.lifted.lifting.prototype_fitting import as_prototype, explain_rays, fit_prototypes
 from sceneprior.lifted.prototypes import POSES, Prototypes, turn_of, turned_extents
 
 MARGIN, CELLS = 1.1, 32
@@ -49,23 +49,23 @@ def objects():
 def test_objects_in_all_poses_teach_one_kind_and_are_known_again_by_their_rays():
     hulls, rays, sizes_m, classes = objects()
     items, usable = np.array([0, 8]), np.ones(10, bool)
-    parts = fit_kinds(items, hulls, rays, sizes_m, classes, usable, ~usable, MARGIN)
+    parts = fit_prototypes(items, hulls, rays, sizes_m, classes, usable, ~usable, MARGIN)
     for found, true in zip(parts, (CORNER, TABLE), strict=True):
         ours, wanted = (filled_cells(each, CELLS, MARGIN) for each in (found, true))
         assert (ours & wanted).sum() > 0.85 * (ours | wanted).sum()
     grids = np.stack([filled_cells(each, CELLS, MARGIN) for each in parts])
     kinds = Prototypes(parts, grids, sizes_m[items], classes[items], np.ones(2, bool))
-    looks = looks_of(kinds, rays, sizes_m, classes, MARGIN)
+    looks = explain_rays(kinds, rays, sizes_m, classes, MARGIN)
     assert looks[:POSES].tolist() == list(range(POSES))
     assert (looks[POSES:] // POSES == 1).all()
-    nobody = looks_of(kinds, rays, sizes_m, np.full(10, 3), MARGIN)
+    nobody = explain_rays(kinds, rays, sizes_m, np.full(10, 3), MARGIN)
     assert (nobody == -1).all(), "no prototype of this class"
 
 
 def test_kinds_do_not_depend_on_the_order_in_which_they_are_fitted():
     hulls, rays, sizes_m, classes = objects()
     usable = np.ones(10, bool)
-    both = fit_kinds(np.array([0, 8]), hulls, rays, sizes_m, classes, usable, ~usable, MARGIN)
-    alone = fit_kinds(np.array([8]), hulls, rays, sizes_m, classes, usable, ~usable, MARGIN)
+    both = fit_prototypes(np.array([0, 8]), hulls, rays, sizes_m, classes, usable, ~usable, MARGIN)
+    alone = fit_prototypes(np.array([8]), hulls, rays, sizes_m, classes, usable, ~usable, MARGIN)
     for here, there in zip(both[1], alone[0], strict=True):
         np.testing.assert_array_equal(here, there)

@@ -8,7 +8,7 @@ from jaxtyping import Int
 
 from sceneprior.core.parts import ACROSS_X, ACROSS_Z, BOX, MOST_PARTS
 from sceneprior.lifted.lifting.part_loss import Change, Guess, RayFit
-from sceneprior.lifted.lifting.part_prices import LEVELS
+from sceneprior.lifted.lifting.part_regularizers import LEVELS
 
 SUPPORT = 4
 """Width in levels of a leg or a panel."""

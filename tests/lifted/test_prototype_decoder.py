@@ -10,7 +10,7 @@ from tiny_runs import tiny_lifted
 from sceneprior.core.colliders import mesh_of
 from sceneprior.core.geometry.turns import turn_grids
 from sceneprior.core.parts import SQUARE, Parts, filled_cells
-from sceneprior.lifted.looks import LookConfig, LookDecoder
+from sceneprior.lifted.prototype_decoder import PrototypeConfig, PrototypeDecoder
 from sceneprior.lifted.prototypes import POSES, Prototypes, turn_of, turned_extents
 from sceneprior.paper.prior import ScenePrior
 
@@ -34,10 +34,10 @@ def prototypes() -> Prototypes:
 
 
 @pytest.fixture
-def decoder(prototypes) -> LookDecoder:
+def decoder(prototypes) -> PrototypeDecoder:
     torch.manual_seed(0)
-    decoder = LookConfig(prototypes=5, codes=30, width=8, cells=8).build(6)
-    decoder.learn_prototypes(prototypes)
+    decoder = PrototypeConfig(prototypes=5, codes=30, width=8, cells=8).build(6)
+    decoder.set_prototypes(prototypes)
     return decoder
 
 
@@ -55,7 +55,7 @@ def test_an_object_has_the_look_whose_code_is_nearest(decoder, torch_rng):
 
 
 def test_prototypes_are_kept_in_checkpoints_and_are_no_weights(decoder, prototypes):
-    fresh = LookConfig(prototypes=5, codes=30, width=8, cells=8).build(6)
+    fresh = PrototypeConfig(prototypes=5, codes=30, width=8, cells=8).build(6)
     assert fresh.known == []
     assert fresh.looks(torch.zeros(2, 30)).tolist() == [0, 0]
     fresh.load_state_dict(decoder.state_dict())
@@ -69,10 +69,10 @@ def test_prototypes_are_kept_in_checkpoints_and_are_no_weights(decoder, prototyp
 
 def test_meshes_turn_and_fill_boxes_as_grids_do():
     """A look's mesh against the cells of its turned grid, on a shape without symmetry."""
-    decoder = LookConfig(prototypes=2, codes=8, cells=32, margin=1.0).build(6)
+    decoder = PrototypeConfig(prototypes=2, codes=8, cells=32, margin=1.0).build(6)
     grids = filled_cells(CORNER, 32, 1.0)[None]
     size_m = np.array([[2.0, 0.5, 1.0]])
-    decoder.learn_prototypes(Prototypes((CORNER,), grids, size_m, np.array([1]), np.ones(1, bool)))
+    decoder.set_prototypes(Prototypes((CORNER,), grids, size_m, np.array([1]), np.ones(1, bool)))
     center_m = np.random.default_rng(0).normal(size=3)
     middles = (np.arange(32) + 0.5) / 32 - 0.5
     points = np.stack(np.meshgrid(middles, middles, middles, indexing="ij"), axis=-1)
@@ -88,10 +88,10 @@ def test_meshes_turn_and_fill_boxes_as_grids_do():
 
 
 def test_a_look_stretches_into_its_box_and_boards_keep_their_thickness():
-    decoder = LookConfig(prototypes=1, codes=8, cells=16).build(6)
+    decoder = PrototypeConfig(prototypes=1, codes=8, cells=16).build(6)
     table = boxes((0, 64, 60, 64, 0, 64), (0, 4, 0, 60, 0, 4), mirrored=(0, 3))
     grids = filled_cells(table, 16, 1.1)[None]
-    decoder.learn_prototypes(
+    decoder.set_prototypes(
         Prototypes((table,), grids, np.ones((1, 3)), np.array([1]), np.ones(1, bool))
     )
     box = np.array([0, 0, 0, 2.0, 1.5, 3.0])
@@ -113,10 +113,10 @@ def test_the_prior_decodes_looks_in_place_of_meshes(prior, torch_rng):
 
 def test_solids_of_a_look_cover_its_mesh_in_every_pose():
     """In each pose, the union of the solids has the volume and the middle of the mesh."""
-    decoder = LookConfig(prototypes=1, codes=8, cells=16).build(6)
+    decoder = PrototypeConfig(prototypes=1, codes=8, cells=16).build(6)
     grids = filled_cells(CORNER, 16, 1.1)[None]
     size_m = np.array([[2.0, 0.5, 1.0]])
-    decoder.learn_prototypes(Prototypes((CORNER,), grids, size_m, np.array([1]), np.ones(1, bool)))
+    decoder.set_prototypes(Prototypes((CORNER,), grids, size_m, np.array([1]), np.ones(1, bool)))
     center_m = np.random.default_rng(1).normal(size=3)
     for pose in range(POSES):
         box = np.array([*center_m, *turned_extents(size_m, pose)[0] * 1.3])

@@ -24,18 +24,23 @@ from sceneprior.core.parts import (
 )
 from sceneprior.core.scene import Mesh, Solid
 from sceneprior.core.views import DecodedScenes
-from sceneprior.lifted.look_paths import pose_rotation, posed_parts, shown_looks, stretched_parts
 from sceneprior.lifted.prototypes import (
     POSES,
     Prototypes,
-    looks_apart,
+    embed_posed,
     turn_of,
     turned_extents,
+)
+from sceneprior.lifted.shape_morphing import (
+    appearances_of,
+    pose_rotation,
+    posed_parts,
+    stretched_parts,
 )
 from sceneprior.paper.layers import ShapeModule, ShapeModuleConfig
 
 
-class LookConfig(ShapeModuleConfig):
+class PrototypeConfig(ShapeModuleConfig):
     """Shapes in parts, chosen among prototypes lifted from the training rooms' masks."""
 
     prototypes: int = Field(1024, ge=1)
@@ -49,9 +54,9 @@ class LookConfig(ShapeModuleConfig):
     margin: float = Field(1.1, ge=1, le=2)
     """Extent of these grids, relative to the object's box."""
 
-    def build(self, features: int) -> "LookDecoder":
+    def build(self, features: int) -> "PrototypeDecoder":
         """The module for object features of width `features`, freshly initialised."""
-        return LookDecoder(features, self)
+        return PrototypeDecoder(features, self)
 
 
 class Posed(NamedTuple):
@@ -63,7 +68,7 @@ class Posed(NamedTuple):
     """Stretches the prototype, in this pose, to other extents."""
 
 
-class LookDecoder(ShapeModule):
+class PrototypeDecoder(ShapeModule):
     """An MLP on MLP1's output predicts a code; the object gets the look whose code is nearest.
 
     Looks are defined in `lifted/prototypes.py`: a prototype shape in one of its poses. Squared
@@ -72,14 +77,14 @@ class LookDecoder(ShapeModule):
     decoded shape is always a sharp prototype rather than a mean of several.
 
     Prototypes and the codes of their looks are buffers, not parameters: they are computed from the
-    training data before the first step (`learn_prototypes`) and saved in checkpoints.
+    training data before the first step (`set_prototypes`) and saved in checkpoints.
     """
 
     faces = None
     unknown: ClassVar[int] = -1
     """Class of unused prototypes, and kind of unused parts."""
 
-    def __init__(self, features: int, config: LookConfig):
+    def __init__(self, features: int, config: PrototypeConfig):
         super().__init__()
         width, most = config.width, config.prototypes
         self.cells, self.margin = config.cells, config.margin
@@ -114,7 +119,7 @@ class LookDecoder(ShapeModule):
         self._shapes: dict[int, Posed] = {}
         self._matched: dict[tuple[int, int], tuple[Parts, Parts]] = {}
 
-    def learn_prototypes(self, prototypes: Prototypes) -> None:
+    def set_prototypes(self, prototypes: Prototypes) -> None:
         """Set the prototypes whose looks are decoded."""
         count = len(prototypes.parts)
         for row, parts in enumerate(prototypes.parts):
@@ -128,13 +133,13 @@ class LookDecoder(ShapeModule):
         self.sizes_m[:count] = torch.from_numpy(prototypes.sizes_m)
         self.object_class[:count] = torch.from_numpy(prototypes.object_class)
         self.common[:count] = torch.from_numpy(prototypes.common)
-        codes = looks_apart(prototypes.grids, self.look_codes.shape[1])
+        codes = embed_posed(prototypes.grids, self.look_codes.shape[1])
         self.look_codes[: count * POSES] = torch.from_numpy(codes)
         self.spread.fill_(float(np.sqrt((codes**2).mean())) or 1.0)
 
     @property
     def prototypes(self) -> Prototypes:
-        """The prototypes set by `learn_prototypes`."""
+        """The prototypes set by `set_prototypes`."""
         rows = self.known
         sizes_m, labels, common = (
             part[rows].cpu().numpy() for part in (self.sizes_m, self.object_class, self.common)
@@ -192,7 +197,7 @@ class LookDecoder(ShapeModule):
         looks, next_looks = rooms.looks.clone(), rooms.looks.clone()
         shares = torch.zeros_like(looks, dtype=torch.float64)
         for item in range(looks.shape[1]):
-            shown = shown_looks(path.looks[:, item].cpu().numpy(), kept[:, item].cpu().numpy())
+            shown = appearances_of(path.looks[:, item].cpu().numpy(), kept[:, item].cpu().numpy())
             for room, place in enumerate(places.tolist() if shown else []):
                 nearest = min(shown, key=lambda each: each.apart(place))
                 looks[room, item], next_looks[room, item], shares[room, item] = nearest.at(place)

@@ -15,7 +15,7 @@ HOLD = 0.125
 follows the decoder more closely, but objects change faster."""
 
 
-class Shown(NamedTuple):
+class Appearance(NamedTuple):
     """Looks shown during one appearance of a prediction on a path, and the place of each."""
 
     places: Float[np.ndarray, " shown"]
@@ -35,7 +35,9 @@ class Shown(NamedTuple):
         return int(look), int(next_look), float((place - start) / (end - start))
 
 
-def shown_looks(looks: Int[np.ndarray, " steps"], kept: Bool[np.ndarray, " steps"]) -> list[Shown]:
+def appearances_of(
+    looks: Int[np.ndarray, " steps"], kept: Bool[np.ndarray, " steps"]
+) -> list[Appearance]:
     """The looks that one prediction shows on a path, for each of its appearances.
 
     `looks` has the decoded look at equal steps from 0 to 1, and `kept` is true where the prediction
@@ -56,7 +58,7 @@ def shown_looks(looks: Int[np.ndarray, " steps"], kept: Bool[np.ndarray, " steps
             if len(run) >= HOLD * (len(looks) - 1)
         ]
         shown = [(ends[0], looks[steps[0]]), *between, (ends[1], looks[steps[-1]])]
-        found.append(Shown(*map(np.array, zip(*shown, strict=True))))
+        found.append(Appearance(*map(np.array, zip(*shown, strict=True))))
     return found
 
 
