@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from sceneprior.core.cameras import Boxes2D, boxes_of_points
-from sceneprior.core.geometry.ellipsoids import boxes_of_ellipsoids
-from sceneprior.core.geometry.meshes import icosphere, place
+from sceneprior.core.ellipsoids import boxes_of_ellipsoids
+from sceneprior.core.meshes import icosphere, place
 
 SIZE = (480, 640)
 

@@ -35,7 +35,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from sceneprior.apps.config import load_config
 from sceneprior.core.cameras import MIN_DEPTH_M, Boxes2D, project
-from sceneprior.core.geometry.meshes import icosphere, place
+from sceneprior.core.meshes import icosphere, place
 from sceneprior.core.views import DecodedScenes, SceneViews
 from sceneprior.paper.config import PaperConfig
 from sceneprior.paper.prior import ScenePrior

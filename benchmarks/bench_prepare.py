@@ -30,7 +30,7 @@ import numpy as np
 
 from sceneprior.core.cameras import Pinhole, look_at
 from sceneprior.core.errors import InputError
-from sceneprior.core.geometry.meshes import icosphere
+from sceneprior.core.meshes import icosphere
 from sceneprior.core.scene import Mesh
 from sceneprior.render.offscreen import open_renderer
 

@@ -21,11 +21,11 @@ from scipy.spatial import cKDTree
 
 from sceneprior.apps.retrieval.cad_models import POINTS, CadModels, ClassModels, unit_mesh
 from sceneprior.apps.retrieval.retrieve import extruded, most_similar, retrieve_all
+from sceneprior.core.boxes import BOX_FACES, CUBE_CORNERS
 from sceneprior.core.furniture import category_table
-from sceneprior.core.geometry.corners import BOX_FACES, CUBE_CORNERS
-from sceneprior.core.geometry.meshes import icosphere
-from sceneprior.core.geometry.surfaces import surface_points
+from sceneprior.core.meshes import icosphere
 from sceneprior.core.scene import Mesh, Scene, SceneObject
+from sceneprior.core.surfaces import surface_points
 
 OBJECTS = 6
 LABEL_SET = "front3d_bedroom"

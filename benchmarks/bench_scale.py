@@ -78,7 +78,7 @@ def data_set(folder: Path, rooms: int) -> dict[str, dict[str, float]]:
 
 def load(shards: Path) -> dict[str, float]:
     """Time two epochs of the shape stage's batches, without turned copies, which read no files."""
-    from sceneprior.core.data.dataset import ViewDataset
+    from sceneprior.core.dataset import ViewDataset
 
     began = time.perf_counter()
     rooms = ViewDataset(shards, "train", 20, mask_step=4)

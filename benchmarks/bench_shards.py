@@ -34,7 +34,7 @@ import torch
 from timed_fit import made_shards
 from torch.utils.data import default_collate
 
-from sceneprior.core.data.dataset import FlatViews, ViewDataset
+from sceneprior.core.dataset import FlatViews, ViewDataset
 from sceneprior.core.shards import RoomViews, iterate_rooms, list_shards
 
 SCENES, VIEWS, STEP = 16, 20, 4

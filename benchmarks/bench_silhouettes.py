@@ -26,7 +26,7 @@ import torch
 from bench_boxes import boxes_ratio
 
 from sceneprior.core.cameras import look_at
-from sceneprior.core.geometry.meshes import icosphere
+from sceneprior.core.meshes import icosphere
 from sceneprior.render.silhouettes import render_scene
 
 SIZE = (90, 120)

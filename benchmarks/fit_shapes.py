@@ -24,8 +24,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from sceneprior.core.data.dataset import ViewDataset
-from sceneprior.core.geometry.meshes import icosphere, place
+from sceneprior.core.dataset import ViewDataset
+from sceneprior.core.meshes import icosphere, place
 from sceneprior.core.overlaps import box_iou_3d
 from sceneprior.core.scene import Mesh
 from sceneprior.core.shards import iterate_rooms

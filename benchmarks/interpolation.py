@@ -27,9 +27,9 @@ from requested_rooms import accuracy
 from rooms_needed import relations, scenes_of
 
 import sceneprior
-from sceneprior.core.geometry.surfaces import chamfer_of, surface_points
 from sceneprior.core.ground_truth import known_in_3d
 from sceneprior.core.scene import Mesh, Scene, SceneObject
+from sceneprior.core.surfaces import chamfer_of, surface_points
 from sceneprior.evaluation.metrics.overlaps import plausible_pairs, room_overlaps
 from sceneprior.paper.decode import DecodedRoom, decode_rooms
 from sceneprior.paper.interpolate import RoomPath, even_places

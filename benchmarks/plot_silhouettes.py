@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from bench_silhouettes import furnished_room
 
-from sceneprior.core.geometry.meshes import icosphere
+from sceneprior.core.meshes import icosphere
 from sceneprior.render.silhouettes import render_scene, render_silhouettes
 
 RADIUS_PX = 12.0

@@ -19,8 +19,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from sceneprior.apps.config import load_config
-from sceneprior.core.data.datamodule import make_loader
-from sceneprior.core.data.dataset import FlatViews, ViewDataset
+from sceneprior.core.dataset import FlatViews, ViewDataset
 from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.views import SceneViews
 from sceneprior.evaluation.metrics.decoded_rooms import reconstruction_scores
@@ -28,6 +27,7 @@ from sceneprior.paper.config import PaperConfig
 from sceneprior.paper.decode import decode_training_rooms
 from sceneprior.paper.prior import TrainedPrior
 from sceneprior.paper.stages import LayoutStage
+from sceneprior.training.loader import make_loader
 
 BASE = Path(__file__).parents[1] / "configs" / "paper/bedroom_small.yaml"
 SETTINGS = (

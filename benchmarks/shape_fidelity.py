@@ -25,11 +25,10 @@ from trimesh.voxel.morphology import fill_orthographic
 
 from sceneprior.apps.config import load_run
 from sceneprior.apps.experiments.evaluate import decoded_and_true
-from sceneprior.core.geometry.isosurface import surface_of
-from sceneprior.core.geometry.meshes import icosphere
-from sceneprior.core.geometry.surfaces import chamfer_of, nearest_distances
+from sceneprior.core.meshes import icosphere
 from sceneprior.core.overlaps import match_scenes
 from sceneprior.core.scene import Mesh, Scene, SceneObject
+from sceneprior.core.surfaces import chamfer_of, nearest_distances, surface_of
 from sceneprior.evaluation.metrics.decoded_rooms import reconstruction_scores
 from sceneprior.evaluation.metrics.frechet import FRECHET
 from sceneprior.evaluation.metrics.mesh_metrics import f_score, sample_surface

@@ -20,13 +20,13 @@ import torch
 from sceneprior.apps.config import load_config, load_run
 from sceneprior.apps.experiments.evaluate import decoded_and_true
 from sceneprior.core.cameras import boxes_of_points
-from sceneprior.core.data.datamodule import make_loader
-from sceneprior.core.data.dataset import ViewDataset
+from sceneprior.core.dataset import ViewDataset
 from sceneprior.evaluation.metrics.decoded_rooms import reconstruction_scores
 from sceneprior.paper.matching import match_objects
 from sceneprior.paper.prior import TrainedPrior
 from sceneprior.render.silhouettes import render_scene
 from sceneprior.training.fit import fit
+from sceneprior.training.loader import make_loader
 
 VARIANTS = ("exact/layered", "exact/paper", "fast/layered", "fast/paper")
 

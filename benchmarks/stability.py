@@ -1,4 +1,4 @@
-"""Share of furniture that does not move in MuJoCo, as generated and after `stand`.
+"""Share of furniture that does not move in MuJoCo, as generated and after `make_stable`.
 
 python benchmarks/stability.py procthor-bedroom procthor-living demo-bedroom --count 40 --seed 1
 """
@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from sceneprior.apps.api import load
+from sceneprior.core.contact_resolution import make_stable
 from sceneprior.core.scene import Scene
-from sceneprior.core.standing import stand
 from sceneprior.evaluation.metrics.stability import Settled, settle
 from sceneprior.render.scene_files import load_scene_folder
 
@@ -28,7 +28,7 @@ def main() -> None:
     for source in options.sources:
         rooms = _rooms(source, options.count, options.seed)
         start = time.perf_counter()
-        standing = [stand(room) for room in rooms]
+        standing = [make_stable(room) for room in rooms]
         seconds = (time.perf_counter() - start) / len(rooms)
         told = sum((changes for _, changes in standing), Counter[str]())
         before = [settle(room) for room in rooms]

@@ -18,8 +18,8 @@ import trimesh
 from tracks import NOISES, ideal_ids, rooms, shuffled
 
 from data_prep.readers.heading import find_turn, turn_matrix
-from sceneprior.core.geometry.turns import yaw_rotation
-from sceneprior.core.instances.observations import observe
+from sceneprior.core.boxes import yaw_rotation
+from sceneprior.core.observations import observe
 from sceneprior.core.shards import MODELS_FOLDER, RoomGroundTruth, RoomViews
 from sceneprior.lifted.lifting.boxes import lift_boxes
 

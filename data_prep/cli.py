@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sceneprior.core.seeds import LARGEST_SEED
+from sceneprior.core.repeatable import LARGEST_SEED
 
 if TYPE_CHECKING:
     from data_prep.engine.build import Job

@@ -6,7 +6,7 @@ import numpy as np
 
 from sceneprior.core.cameras import Pinhole
 from sceneprior.core.classes import STUFF
-from sceneprior.core.instances.observations import observe
+from sceneprior.core.observations import observe
 from sceneprior.core.scene import Mesh
 from sceneprior.core.shards import RoomViews, stuff_size, stuff_step, thinned_intrinsics
 from sceneprior.render.offscreen import SoftwareRenderer

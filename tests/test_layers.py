@@ -40,15 +40,15 @@ MAY_TOO = {
 
 BUDGET = {
     "data_prep": (13743, 110),
-    "sceneprior/core": (6039, 47),
+    "sceneprior/core": (5937, 35),
     "sceneprior/furniture": (586, 4),
-    "sceneprior/render": (4598, 36),
-    "sceneprior/training": (859, 8),
+    "sceneprior/render": (4596, 36),
+    "sceneprior/training": (929, 9),
     "sceneprior/paper": (2710, 24),
     "sceneprior/lifted": (8874, 68),
     "sceneprior/baselines": (3103, 28),
     "sceneprior/evaluation": (4840, 38),
-    "sceneprior/interchange": (1001, 9),
+    "sceneprior/interchange": (1000, 9),
     "sceneprior/apps": (7758, 57),
 }
 """Most lines and modules of a folder. They go down freely, and up only in a commit that says what
@@ -79,12 +79,12 @@ OWNERS = {
     "typer": ["sceneprior/apps/cli/", "data_prep/cli.py"],
     "jinja2": ["sceneprior/evaluation/"],
     "efficientnet_lite_pytorch": ["sceneprior/evaluation/"],
-    "skimage": ["sceneprior/core/geometry/isosurface", "sceneprior/lifted/lifting/outlines"],
-    "manifold3d": ["sceneprior/core/geometry/part_meshes.py", "sceneprior/core/shell.py"],
-    "fast_simplification": ["sceneprior/core/geometry/isosurface.py"],
+    "skimage": ["sceneprior/core/surfaces", "sceneprior/lifted/lifting/outlines"],
+    "manifold3d": ["sceneprior/core/parts.py", "sceneprior/core/shell.py"],
+    "fast_simplification": ["sceneprior/core/surfaces.py"],
     "sklearn": ["sceneprior/evaluation/", "sceneprior/lifted/sampler/stage"],
     "scipy.optimize": [
-        "sceneprior/core/overlaps.py", "sceneprior/core/geometry/part_blends.py",
+        "sceneprior/core/overlaps.py", "sceneprior/core/part_blends.py",
         "sceneprior/paper/matching.py",
         "sceneprior/evaluation/", "data_prep/inspection/causes.py",
     ],

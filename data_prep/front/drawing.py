@@ -12,7 +12,7 @@ from data_prep.front.rgb import soup
 from data_prep.front.viewpoints import Viewpoints, intrinsics, sees_enough
 from sceneprior.core.cameras import Pinhole
 from sceneprior.core.classes import STUFF, VOID, label_set
-from sceneprior.core.instances.observations import observe, pixel_counts
+from sceneprior.core.observations import observe, pixel_counts
 from sceneprior.core.scene import Mesh
 from sceneprior.core.shards import (
     RoomGroundTruth,

@@ -7,7 +7,7 @@ import shapely
 
 from data_prep.front.furnished import Room
 from data_prep.front.recipe import Recipe
-from sceneprior.core.instances.checked import shown
+from sceneprior.core.checked import shown
 
 
 def broken_rule(room: Room, recipe: Recipe) -> tuple[str, str] | None:

@@ -11,9 +11,9 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from data_prep.readers.upright import own_sides
+from sceneprior.core.boxes import BOX_EDGES, box_corners
 from sceneprior.core.cameras import to_camera, to_pixels
 from sceneprior.core.errors import ShardError
-from sceneprior.core.geometry.corners import BOX_EDGES, box_corners
 from sceneprior.core.ground_truth import load_model, model_path
 from sceneprior.core.shards import RoomGroundTruth, RoomViews
 

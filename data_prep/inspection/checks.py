@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from sceneprior.core.classes import VOID
-from sceneprior.core.instances.observations import observe
+from sceneprior.core.observations import observe
 from sceneprior.core.shards import RoomGroundTruth, RoomViews
 
 

@@ -29,7 +29,7 @@ from data_prep.inspection.evidence import Evidence, fit, middles
 from data_prep.inspection.messages import UNITS_M, wrong_ids, wrong_unit, wrong_up
 from data_prep.tracks.associate import UNKNOWN, FrameMasks, associate
 from sceneprior.core.classes import VOID
-from sceneprior.core.instances.observations import observe
+from sceneprior.core.observations import observe
 from sceneprior.core.shards import RoomViews
 
 _SPARE_AT_LEAST = 12

@@ -8,10 +8,10 @@ import shapely
 from PIL import Image, ImageDraw, ImageFont
 
 from data_prep.inspection.agreement import NEAR_M
+from sceneprior.core.boxes import BOX_EDGES, box_corners
 from sceneprior.core.cameras import camera_centers, to_camera, to_pixels
 from sceneprior.core.classes import class_colors, label_set
 from sceneprior.core.found_floor import find_floor
-from sceneprior.core.geometry.corners import BOX_EDGES, box_corners
 from sceneprior.core.shards import RoomGroundTruth, RoomViews, Shard
 from sceneprior.render.pictures import paint_ids
 

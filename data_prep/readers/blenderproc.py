@@ -28,9 +28,9 @@ from data_prep.front.recipe import Recipe
 from data_prep.readers.files import read_hdf5
 from data_prep.readers.frames import GL_TO_CV
 from data_prep.readers.rooms import FoundRoom, FramedRoom, Reader, chosen_frames, sampled
+from sceneprior.core.checked import plain, shown
 from sceneprior.core.errors import InputError
 from sceneprior.core.furniture import INFO_FILES, model_categories, tidy_category
-from sceneprior.core.instances.checked import plain, shown
 
 LABELS = "blender_label_mapping.csv"
 _FROM_BLENDER = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])

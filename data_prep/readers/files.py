@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from sceneprior.core.checked import plain
 from sceneprior.core.errors import InputError
-from sceneprior.core.instances.checked import plain
 
 _MOST_VALUES = 64 << 20
 """Maximum number of values in an array; images and trajectories have far fewer."""

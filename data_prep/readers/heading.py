@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int, Integer
 from scipy import ndimage
 
-from sceneprior.core.geometry.turns import yaw_rotation
+from sceneprior.core.boxes import yaw_rotation
 from sceneprior.core.shards import RoomViews, stuff_step, thinned, thinned_intrinsics
 
 ALIGNED_DEG = 1.0

@@ -34,8 +34,8 @@ from data_prep.readers.rooms import (
     sampled,
 )
 from data_prep.readers.tilt import pinhole, straight_grid
+from sceneprior.core.checked import plain
 from sceneprior.core.errors import InputError
-from sceneprior.core.instances.checked import plain
 
 CAMERAS = "metadata_camera_parameters.csv"
 _BOXES = "metadata_semantic_instance_bounding_box_object_aligned_2d_{}.hdf5"

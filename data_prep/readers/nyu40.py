@@ -4,7 +4,7 @@ import numpy as np
 
 from data_prep.readers.scannet.labels import SHELL
 from sceneprior.core.errors import InputError
-from sceneprior.core.instances.tables import LARGEST_ID, stuff_of
+from sceneprior.core.id_tables import LARGEST_ID, stuff_of
 
 NYU40 = (
     "wall", "floor", "cabinet", "bed", "chair", "sofa", "table", "door", "window", "bookshelf",

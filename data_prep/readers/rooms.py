@@ -19,11 +19,11 @@ from data_prep.readers.frames import (
 )
 from data_prep.readers.heading import find_turn, note_of_turn, turn_matrix
 from data_prep.readers.scannet.labels import LABEL_SET
+from sceneprior.core.boxes import CUBE_CORNERS
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.geometry.corners import CUBE_CORNERS
-from sceneprior.core.instances.observations import Observations, observe
-from sceneprior.core.instances.tables import IdTable, tidy
+from sceneprior.core.id_tables import IdTable, tidy
+from sceneprior.core.observations import Observations, observe
 from sceneprior.core.outline import rectangle
 from sceneprior.core.shards import RoomGroundTruth, thinned_stuff
 

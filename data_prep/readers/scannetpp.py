@@ -37,10 +37,10 @@ from data_prep.readers.scannet.annotations import (
     read_segments,
 )
 from data_prep.readers.scannet.labels import LABEL_SET, Labels, read_labels
+from sceneprior.core.checked import checked
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
-from sceneprior.core.instances.checked import checked
 from sceneprior.core.scene import Mesh
 from sceneprior.render.offscreen.zbuffer import rasterize
 

@@ -33,10 +33,10 @@ from data_prep.readers.rooms import (
     sampled,
 )
 from sceneprior.core.cameras import odd_field_of_view
+from sceneprior.core.checked import checked, shown
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
-from sceneprior.core.instances.checked import checked, shown
-from sceneprior.core.instances.pngs import mask_size, read_mask
+from sceneprior.core.id_tables import mask_size, read_mask
 
 _NONE = 65_535
 _METRES = 1e-3

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sceneprior.core.boxes import CUBE_CORNERS
 from sceneprior.core.cameras import camera_centers, nearest_to_rays, pixel_rays
-from sceneprior.core.geometry.corners import CUBE_CORNERS
 from sceneprior.core.shards import Sightings
 
 VIEWS_AT_MOST = 10

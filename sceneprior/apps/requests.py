@@ -5,9 +5,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from sceneprior.core.checked import checked
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
-from sceneprior.core.instances.checked import checked
 from sceneprior.core.scene_json import MOST_OBJECTS, ObjectEntry, read_object
 from sceneprior.interchange.floors import read_floor_file
 

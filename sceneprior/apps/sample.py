@@ -4,9 +4,8 @@ from collections.abc import Sequence
 
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
+from sceneprior.core.repeatable import check_seed, single_threaded
 from sceneprior.core.scene import Scene, SceneObject
-from sceneprior.core.seeds import check_seed
-from sceneprior.core.threads import single_threaded
 from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.sampled import drawn_by_sampler, sample_scenes
 from sceneprior.paper.decode import decode_latents

@@ -13,9 +13,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from sceneprior.baselines.one_stage import OneStage, OneStageConfig
-from sceneprior.core.data.dataset import BLANK, RoomDataset
+from sceneprior.core.boxes import turn_boxes
+from sceneprior.core.dataset import BLANK, RoomDataset
 from sceneprior.core.errors import ShardError
-from sceneprior.core.geometry.turns import turn_boxes
 from sceneprior.core.shards import RoomGroundTruth, Shard
 from sceneprior.core.views import RoomBoxes
 from sceneprior.paper.losses import share_of_batch

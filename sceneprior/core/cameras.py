@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
-from sceneprior.core.geometry.corners import Array
+from sceneprior.core.boxes import Array
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -8,10 +8,10 @@ import numpy as np
 import shapely
 from pydantic import BaseModel, ConfigDict, Field
 
+from sceneprior.core.checked import checked
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import json_text, read_json
-from sceneprior.core.instances.checked import checked
 from sceneprior.core.scene import Opening, Scene, SceneObject, Solid, Turned, bound_m
 
 FORMAT = "sceneprior-scene"

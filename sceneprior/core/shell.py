@@ -10,7 +10,6 @@ import shapely
 from jaxtyping import Float
 
 from sceneprior.core.errors import InputError
-from sceneprior.core.geometry.part_meshes import prism, triangles_of
 from sceneprior.core.outline import (
     Wall,
     floor_rectangle,
@@ -18,6 +17,7 @@ from sceneprior.core.outline import (
     wall_of_opening,
     walls_of,
 )
+from sceneprior.core.parts import prism, triangles_of
 from sceneprior.core.scene import Mesh, Opening, Scene
 
 ShellName = Literal["walls", "floor", "none"]

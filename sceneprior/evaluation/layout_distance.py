@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sceneprior.core.geometry.turns import QUARTERS, quarter_rotation
+from sceneprior.core.boxes import QUARTERS, quarter_rotation
 from sceneprior.core.scene import Scene
 
 MISSING_M = 1.0

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from sceneprior.core.errors import InputError
-from sceneprior.core.threads import single_threaded
+from sceneprior.core.repeatable import single_threaded
 
 CHUNK = 2
 """Images per forward pass, chosen to fit the caches of two cores. The last chunk is padded with

@@ -12,9 +12,9 @@ from markupsafe import Markup
 from PIL import Image
 
 from sceneprior import __version__
-from sceneprior.core.geometry.isosurface import decimate
 from sceneprior.core.scene import Mesh, Scene
 from sceneprior.core.shell import ShellName, shell_of
+from sceneprior.core.surfaces import decimate
 from sceneprior.render.pictures import png_bytes
 from sceneprior.render.scene_files import scene_to_glb
 from sceneprior.render.topdown import corner_view, shows_walls

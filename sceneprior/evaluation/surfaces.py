@@ -5,8 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sceneprior.core.geometry.corners import BOX_FACES, CUBE_CORNERS
-from sceneprior.core.geometry.turns import yaw_rotation
+from sceneprior.core.boxes import BOX_FACES, CUBE_CORNERS, yaw_rotation
 from sceneprior.core.scene import SceneObject, Turned
 
 Triangles = Float[np.ndarray, "_ 3 3"]

@@ -11,10 +11,10 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
+from sceneprior.core.contact_resolution import make_stable
 from sceneprior.core.errors import InputError
 from sceneprior.core.ground_truth import independent_rooms, reference_scenes, shuffled_rooms
 from sceneprior.core.scene import Scene
-from sceneprior.core.standing import stand
 from sceneprior.evaluation.bootstrap import METHOD, Estimate, ratio, resample_counts
 from sceneprior.evaluation.metric import Counts
 from sceneprior.evaluation.metrics import clearance, stability
@@ -38,7 +38,7 @@ class UseOptions:
     """Compute the metrics of use only."""
     stand: bool = False
     """First make the objects of generated rooms stand, by setting them down, adding feet and moving
-    them apart (`stand`)."""
+    them apart (`make_stable`)."""
 
     def __post_init__(self) -> None:
         if self.settle not in SETTLED:
@@ -154,7 +154,7 @@ def evaluate_use(
         raise InputError("There are no scenes to evaluate; give at least one.")
     names = common_label_set(generated)
     if use.stand:
-        generated = [stand(scene)[0] for scene in generated]
+        generated = [make_stable(scene)[0] for scene in generated]
     sets: dict[str, Sequence[Scene]] = {"generated": generated}
     if shards is not None:
         sets |= real_and_random(shards, options.split, len(generated), options.seed)

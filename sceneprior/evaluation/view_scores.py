@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from sceneprior.core.errors import InputError
-from sceneprior.core.geometry.surfaces import chamfer_of, nearest_distances
 from sceneprior.core.overlaps import box_iou_3d
 from sceneprior.core.scene import SceneObject
+from sceneprior.core.surfaces import chamfer_of, nearest_distances
 from sceneprior.evaluation.bootstrap import COVERAGE, ratio, resample_counts
 from sceneprior.evaluation.metrics.mesh_metrics import (
     F_THRESHOLD_M,

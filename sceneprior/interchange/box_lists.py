@@ -9,10 +9,10 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
+from sceneprior.core.boxes import yaw_rotation
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
-from sceneprior.core.geometry.turns import yaw_rotation
 from sceneprior.core.scene import Mesh, Scene, SceneObject, Turned, bound_m
 from sceneprior.core.scene_json import MOST_OBJECTS, check_box, check_floor
 from sceneprior.render.appearance import box_mesh

@@ -5,11 +5,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from sceneprior.core.contact_resolution import make_stable
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import write_whole
 from sceneprior.core.scene import Scene
 from sceneprior.core.shell import ShellName, shell_meshes, shell_of
-from sceneprior.core.standing import stand
 from sceneprior.interchange.atiss import write_atiss
 from sceneprior.interchange.front import write_front
 from sceneprior.interchange.habitat import write_habitat
@@ -41,7 +41,7 @@ SIMULATORS: Mapping[str, Callable[[Sequence[Scene], Path, ShellName], None]] = {
     "usd": _write_usd,
     "habitat": write_habitat,
 }
-"""Simulator formats; objects are made physically stable before export (`core/standing.py`)."""
+"""Simulator formats; before export, objects are made stable (`core/contact_resolution.py`)."""
 FORMATS = (*CLASS_FORMATS, *SIMULATORS, "sceneeval", "obj")
 GROWN_M = 0.01
 """Threshold in metres: a note mentions walls that furniture pushed outwards by more."""
@@ -68,7 +68,7 @@ def export_scenes(
             save(scene, Path(folder) / f"{scene.name}.obj", shell=shell or "none")
         return []
     if to in SIMULATORS:
-        standing, notes = stand_all(scenes)
+        standing, notes = make_all_stable(scenes)
         SIMULATORS[to](standing, Path(folder), shell or "walls")
         return notes if shell in ("floor", "none") else [*notes, *_moved_walls(standing)]
     if shell is not None:
@@ -87,9 +87,9 @@ def export_scenes(
     return []
 
 
-def stand_all(scenes: Sequence[Scene]) -> tuple[list[Scene], list[str]]:
+def make_all_stable(scenes: Sequence[Scene]) -> tuple[list[Scene], list[str]]:
     """Make all objects of the scenes stand; also return a note on the changes, if any."""
-    pairs = [stand(scene) for scene in scenes]
+    pairs = [make_stable(scene) for scene in scenes]
     changes = sum((counts for _, counts in pairs), Counter[str]())
     standing = [scene for scene, _ in pairs]
     listed = ", ".join(f"{count} {change}" for change, count in changes.items() if count)

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import shapely
 
+from sceneprior.core.checked import number_array
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
-from sceneprior.core.instances.checked import number_array
 from sceneprior.core.scene import Opening
 from sceneprior.core.scene_json import FORMAT, check_floor, read_scene
 from sceneprior.interchange.box_lists import FLOOR, floor_outline

@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from sceneprior.core.colliders import colliders, is_fixed, mesh_of
+from sceneprior.core.boxes import yaw_rotation
+from sceneprior.core.colliders import colliders, is_fixed, mass_kg, mesh_of
 from sceneprior.core.files import write_json, write_whole
-from sceneprior.core.geometry.turns import yaw_rotation
-from sceneprior.core.masses import mass_kg
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.core.shell import ShellName, shell_meshes
 from sceneprior.render.appearance import node_names, scene_meshes

@@ -17,8 +17,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from sceneprior.core.checked import number_array, shown
 from sceneprior.core.errors import InputError
-from sceneprior.core.instances.checked import number_array, shown
 from sceneprior.core.scene import Opening
 from sceneprior.core.scene_json import check_floor
 

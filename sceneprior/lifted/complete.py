@@ -23,9 +23,9 @@ from torch.nn import functional as F
 
 from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.errors import InputError
+from sceneprior.core.repeatable import check_seed
 from sceneprior.core.scene import Scene
 from sceneprior.core.scene_json import check_box
-from sceneprior.core.seeds import check_seed
 from sceneprior.core.views import DecodedScenes, RoomBoxes
 from sceneprior.lifted.config import TrainedLifted
 from sceneprior.lifted.insert import insert

@@ -12,14 +12,15 @@ from jaxtyping import Bool, Float, Int
 from pydantic import Field
 from torch import Tensor, nn
 
-from sceneprior.core.geometry.part_blends import blend_parts, matched_parts
-from sceneprior.core.geometry.part_meshes import Stretch, surface_of_parts
+from sceneprior.core.part_blends import blend_parts, matched_parts
 from sceneprior.core.parts import (
     KIND_NAMES,
     MOST_CORNERS,
     MOST_PARTS,
     Parts,
+    Stretch,
     filled_cells,
+    surface_of_parts,
     whole_box,
 )
 from sceneprior.core.scene import Mesh, Solid

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from sceneprior.core.geometry.turns import QUARTERS, turn_grids
+from sceneprior.core.boxes import QUARTERS, turn_grids
 from sceneprior.core.parts import Parts
 
 POSES = 2 * QUARTERS

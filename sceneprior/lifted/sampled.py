@@ -10,8 +10,8 @@ from torch import Tensor
 from sceneprior.core.classes import label_set, unknown_class
 from sceneprior.core.errors import InputError
 from sceneprior.core.outline import rectangle
+from sceneprior.core.repeatable import single_threaded
 from sceneprior.core.scene import Mesh, Scene, SceneObject, Solid, quarter_turned
-from sceneprior.core.threads import single_threaded
 from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.config import SAMPLER, TrainedLifted
 from sceneprior.lifted.lifting import HANGS_M

@@ -5,9 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sceneprior.core.geometry.part_meshes import Stretch
-from sceneprior.core.geometry.turns import quarter_rotation
-from sceneprior.core.parts import SQUARE, Parts
+from sceneprior.core.boxes import quarter_rotation
+from sceneprior.core.parts import SQUARE, Parts, Stretch
 from sceneprior.lifted.prototypes import turn_of
 
 HOLD = 0.125

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 from torch import nn
 
-from sceneprior.core.data.dataset import ViewDataset
+from sceneprior.core.dataset import ViewDataset
 from sceneprior.paper.prior import ModelConfig, PriorConfig
 from sceneprior.paper.settings import (
     LayoutConfig,

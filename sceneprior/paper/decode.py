@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sceneprior.core.classes import VOID, label_set
+from sceneprior.core.repeatable import single_threaded
 from sceneprior.core.scene import Scene, SceneObject
-from sceneprior.core.threads import single_threaded
 from sceneprior.core.views import DecodedScenes
 from sceneprior.paper.losses import kept_objects
 from sceneprior.paper.prior import ScenePrior, TrainedPrior, with_training_latents

@@ -14,8 +14,8 @@ from torch import Tensor
 from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import write_whole
+from sceneprior.core.repeatable import single_threaded
 from sceneprior.core.scene import Scene
-from sceneprior.core.threads import single_threaded
 from sceneprior.core.views import DecodedScenes
 from sceneprior.paper.decode import DecodedRoom, decode_rooms, kept_predictions
 from sceneprior.paper.prior import TrainedPrior

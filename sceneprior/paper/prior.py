@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
-from sceneprior.core.data.dataset import ViewDataset
+from sceneprior.core.dataset import ViewDataset
 from sceneprior.core.errors import InputError
 from sceneprior.core.settings import Section
 from sceneprior.core.views import DecodedScenes

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from sceneprior.core.errors import InputError, InputWarning
 from sceneprior.core.files import write_whole
+from sceneprior.core.repeatable import check_seed
 from sceneprior.core.scene import Scene
-from sceneprior.core.seeds import check_seed
 from sceneprior.paper.latents import LatentSpace
 from sceneprior.paper.prior import SHIPPED_WITH_LATENTS, TrainedPrior
 

@@ -10,7 +10,7 @@ from zlib import crc32
 import numpy as np
 from jaxtyping import UInt8
 
-from sceneprior.core.geometry.corners import BOX_FACES, box_corners
+from sceneprior.core.boxes import BOX_FACES, box_corners
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 
 BACKGROUND = (255, 255, 255)

@@ -6,8 +6,7 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 from jaxtyping import Float
 
-from sceneprior.core.colliders import colliders, is_fixed, points_of, volume_and_centroid
-from sceneprior.core.masses import mass_kg
+from sceneprior.core.colliders import colliders, is_fixed, mass_kg, points_of, volume_and_centroid
 from sceneprior.core.scene import Mesh, Scene, SceneObject, Solid
 from sceneprior.core.shell import Panel, Shell, panels
 from sceneprior.render.appearance import FLOOR_COLOR, WALL_COLOR, node_names, object_colors

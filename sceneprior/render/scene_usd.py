@@ -5,9 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from sceneprior.core.colliders import colliders, is_fixed, mesh_of
+from sceneprior.core.colliders import colliders, is_fixed, mass_kg, mesh_of
 from sceneprior.core.errors import InputError
-from sceneprior.core.masses import mass_kg
 from sceneprior.core.scene import Mesh, Scene, Solid
 from sceneprior.render.appearance import (
     linear_rgba,

@@ -19,8 +19,8 @@ from torch import nn
 
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
+from sceneprior.core.repeatable import LARGEST_SEED
 from sceneprior.core.scene import Mesh
-from sceneprior.core.seeds import LARGEST_SEED
 from sceneprior.core.settings import Section
 from sceneprior.core.shards import Shard, list_shards
 from sceneprior.core.views import RoomBoxes, SceneViews

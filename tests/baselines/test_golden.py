@@ -13,7 +13,7 @@ from pydantic import TypeAdapter
 from torch.nn import functional as F
 
 from sceneprior.apps.decoders import Decoder
-from sceneprior.core.data.dataset import ViewDataset
+from sceneprior.core.dataset import ViewDataset
 from sceneprior.core.views import RoomBoxes
 from sceneprior.training.fit import fit
 

@@ -12,9 +12,9 @@ import torch
 
 import sceneprior
 from sceneprior.baselines.true_boxes import TruthDataset
-from sceneprior.core.data.dataset import BLANK, ViewDataset
+from sceneprior.core.boxes import box_corners
+from sceneprior.core.dataset import BLANK, ViewDataset
 from sceneprior.core.errors import ShardError
-from sceneprior.core.geometry.corners import box_corners
 from sceneprior.core.shards import Shard, iterate_rooms
 from sceneprior.training.fit import fit
 

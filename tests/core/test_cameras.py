@@ -8,6 +8,7 @@ import torch
 from torch.testing import assert_close
 from toy_rooms import look_at
 
+from sceneprior.core.boxes import box_corners
 from sceneprior.core.cameras import (
     MIN_DEPTH_M,
     boxes_of_points,
@@ -15,7 +16,6 @@ from sceneprior.core.cameras import (
     pixel_rays,
     project,
 )
-from sceneprior.core.geometry.corners import box_corners
 
 LENS = torch.tensor([[50.0, 0, 40], [0, 60, 30], [0, 0, 1]], dtype=torch.float64)
 SIZE = (60, 80)

@@ -5,7 +5,6 @@ import pytest
 import trimesh
 from parts_of_rooms import CORNER, TABLE, boxes
 
-from sceneprior.core.geometry.part_meshes import THIN_M, Stretch, surface_of_parts
 from sceneprior.core.parts import (
     ACROSS_X,
     BOWL,
@@ -13,9 +12,12 @@ from sceneprior.core.parts import (
     CYLINDER,
     DOME,
     ELLIPSOID,
+    THIN_M,
     Parts,
+    Stretch,
     filled_cells,
     inside,
+    surface_of_parts,
 )
 
 CURVED = [

@@ -5,8 +5,8 @@ import pytest
 import sceneprior
 from sceneprior.apps.config import load_config
 from sceneprior.core.errors import ConfigError, InputError
+from sceneprior.core.repeatable import LARGEST_SEED, check_seed
 from sceneprior.core.scene import Scene
-from sceneprior.core.seeds import LARGEST_SEED, check_seed
 
 TWENTY_DIGITS = 10**20 - 1
 

@@ -8,8 +8,8 @@ import shapely
 import trimesh
 from rooms_of_solids import solid_box
 
+from sceneprior.core.boxes import yaw_rotation
 from sceneprior.core.errors import InputError
-from sceneprior.core.geometry.turns import yaw_rotation
 from sceneprior.core.scene import Opening, Scene
 from sceneprior.core.shell import THICK_M, Shell, panels, shell_meshes, shell_of
 

@@ -7,7 +7,7 @@ import pytest
 from posed_files import PosedRoom, Thing, prepared
 
 from data_prep.readers.heading import _votes_of_image, find_turn, note_of_turn, turn_matrix
-from sceneprior.core.geometry.turns import yaw_rotation
+from sceneprior.core.boxes import yaw_rotation
 
 K = np.array([[80.0, 0, 64], [0, 80.0, 48], [0, 0, 1]])
 SIZE = (96, 128)

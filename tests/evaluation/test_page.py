@@ -15,9 +15,9 @@ from browser import picture, wait_for
 from PIL import Image
 
 import sceneprior.evaluation
-from sceneprior.core.geometry.corners import BOX_FACES
-from sceneprior.core.geometry.isosurface import surface_of
+from sceneprior.core.boxes import BOX_FACES
 from sceneprior.core.scene import Mesh, Opening, Scene, SceneObject
+from sceneprior.core.surfaces import surface_of
 from sceneprior.evaluation.page import FACES_PER_PAGE, faces_per_object, glb_of
 from sceneprior.evaluation.rooms_page import ROOMS_SHOWN, write_rooms_page
 

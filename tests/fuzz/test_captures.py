@@ -32,8 +32,8 @@ from data_prep.readers.posed.views import PosedSettings, prepare_posed
 from data_prep.readers.scannet.labels import read_labels
 from data_prep.readers.scannet.scans import ScanSettings, read_scan
 from data_prep.readers.scannet.views import prepare_scan
+from sceneprior.core.coco import read_coco
 from sceneprior.core.errors import InputError
-from sceneprior.core.instances.coco import read_coco
 
 pytestmark = pytest.mark.slow
 

@@ -22,7 +22,7 @@ def shard(tmp_path_factory) -> bytes:
 
 def read_all(path: Path) -> None:
     """Everything that a shard is asked for."""
-    from sceneprior.core.data.dataset import FlatViews
+    from sceneprior.core.dataset import FlatViews
     from sceneprior.core.shards import Shard
 
     with Shard(path) as opened:

@@ -10,8 +10,7 @@ import shapely
 import trimesh
 from rooms_of_solids import solid_box
 
-from sceneprior.core.colliders import colliders, mesh_of
-from sceneprior.core.masses import mass_kg
+from sceneprior.core.colliders import colliders, mass_kg, mesh_of
 from sceneprior.core.scene import Opening, Scene, SceneObject, Solid, Turned, bound_m
 from sceneprior.interchange.export import export_scenes
 from sceneprior.render.scene_files import save

@@ -7,8 +7,8 @@ import trimesh
 from parts_of_rooms import CORNER, boxes
 from tiny_runs import tiny_lifted
 
+from sceneprior.core.boxes import turn_grids
 from sceneprior.core.colliders import mesh_of
-from sceneprior.core.geometry.turns import turn_grids
 from sceneprior.core.parts import SQUARE, Parts, filled_cells
 from sceneprior.lifted.prototype_decoder import PrototypeConfig, PrototypeDecoder
 from sceneprior.lifted.prototypes import POSES, Prototypes, turn_of, turned_extents

@@ -6,7 +6,7 @@ import torch
 from parts_of_rooms import boxes
 from rooms_of_boxes import CELLS
 
-from sceneprior.core.geometry.turns import turn_grids
+from sceneprior.core.boxes import turn_grids
 from sceneprior.lifted.prototypes import (
     POSES,
     Prototypes,

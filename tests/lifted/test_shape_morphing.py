@@ -6,8 +6,7 @@ import torch
 import trimesh
 from parts_of_rooms import CORNER, TABLE
 
-from sceneprior.core.geometry.part_meshes import Stretch, surface_of_parts
-from sceneprior.core.parts import filled_cells
+from sceneprior.core.parts import Stretch, filled_cells, surface_of_parts
 from sceneprior.core.views import DecodedScenes
 from sceneprior.lifted.prototype_decoder import PrototypeConfig, PrototypeDecoder
 from sceneprior.lifted.prototypes import POSES, Prototypes, turned_extents

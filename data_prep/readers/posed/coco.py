@@ -15,9 +15,8 @@ from pydantic import BaseModel
 
 from data_prep.readers.posed.mask_format import MaskFormat, instead, main_classes
 from data_prep.readers.posed.recording import PosedFrame
-from sceneprior.core.errors import InputError
-from sceneprior.core.instances.checked import checked, shown
-from sceneprior.core.instances.coco import (
+from sceneprior.core.checked import checked, shown
+from sceneprior.core.coco import (
     CROWD,
     Category,
     CocoId,
@@ -27,7 +26,8 @@ from sceneprior.core.instances.coco import (
     paint,
     read_coco_json,
 )
-from sceneprior.core.instances.tables import LARGEST_ID
+from sceneprior.core.errors import InputError
+from sceneprior.core.id_tables import LARGEST_ID
 
 FILES = ("*coco*.json", "instances*.json", "annotations*.json", "annotations/*.json")
 """Glob patterns of COCO's JSON in a room's folder."""

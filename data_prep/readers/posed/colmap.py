@@ -12,8 +12,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from sceneprior.core.checked import plain
 from sceneprior.core.errors import InputError
-from sceneprior.core.instances.checked import plain
 
 FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 """Folders in which COLMAP or nerfstudio put a model."""

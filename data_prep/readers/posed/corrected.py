@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from data_prep.readers.posed.tangents import Gaps, Outlines, find_outlines, measure_gaps
 from sceneprior.core.cameras import camera_at, camera_centers
 from sceneprior.core.classes import VOID
-from sceneprior.core.instances.observations import Observations, observe
+from sceneprior.core.observations import Observations, observe
 
 WRONG_PX, LESS = 0.3, 0.9
 """Poses are corrected if the median gap exceeds `WRONG_PX`, and if a correction that is fitted to

@@ -7,7 +7,7 @@ of the lowest boxes. The boxes are used for nothing else.
 import numpy as np
 
 from data_prep.readers.upright import fit_upright, own_sides
-from sceneprior.core.instances.observations import Observations
+from sceneprior.core.observations import Observations
 
 _MISFIT_SHARE = 0.01
 """Maximum mean distance between a projected box and its 2D boxes, relative to the image's longer

@@ -13,8 +13,8 @@ from data_prep.readers.posed.mask_format import MaskFormat
 from data_prep.readers.posed.panoptic import PanopticPngs
 from data_prep.readers.posed.sam2 import ObjectFolders
 from data_prep.readers.posed.transforms import POSES, pose_files
+from sceneprior.core.checked import shown
 from sceneprior.core.errors import InputError
-from sceneprior.core.instances.checked import shown
 
 _MASKS: tuple[type[MaskFormat], ...] = (
     IdPngs, PanopticPngs, ObjectFolders, GroundedSam2, GroundedSam2Images, CocoMasks,

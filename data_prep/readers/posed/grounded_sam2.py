@@ -14,10 +14,10 @@ from pydantic import BaseModel, Field
 from data_prep.readers.posed.coco import SegmentedFrame, SegmentedFrames
 from data_prep.readers.posed.mask_format import MaskFormat, instead, main_classes
 from data_prep.readers.posed.recording import PosedFrame
+from sceneprior.core.checked import checked, plain
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
-from sceneprior.core.instances.checked import checked, plain
-from sceneprior.core.instances.tables import LARGEST_ID
+from sceneprior.core.id_tables import LARGEST_ID
 
 MASKS, LABELS, PREFIX = "mask_data", "json_data", "mask_"
 

@@ -9,8 +9,7 @@ from data_prep.readers.posed.labels import TABLES, find_table
 from data_prep.readers.posed.mask_format import MaskFormat
 from data_prep.readers.posed.recording import INSTANCES, PosedFrame
 from sceneprior.core.errors import InputError
-from sceneprior.core.instances.pngs import mask_size, read_mask
-from sceneprior.core.instances.tables import read_class_table
+from sceneprior.core.id_tables import mask_size, read_class_table, read_mask
 
 
 class IdPngs(MaskFormat):

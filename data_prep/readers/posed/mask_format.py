@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from data_prep.readers.posed.recording import PosedFrame
-from sceneprior.core.instances.checked import plain
+from sceneprior.core.checked import plain
 
 _LISTED = 3
 

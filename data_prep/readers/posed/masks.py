@@ -6,10 +6,9 @@ from data_prep.readers.frames import mask_intrinsics, sampled_lines
 from data_prep.readers.posed.lens import Lens, Straightened, straighten
 from data_prep.readers.posed.mask_format import MaskFormat
 from data_prep.readers.posed.recording import PosedFrame, frame_intrinsics
+from sceneprior.core.checked import shown
 from sceneprior.core.errors import InputError
-from sceneprior.core.instances.checked import shown
-from sceneprior.core.instances.pngs import read_mask
-from sceneprior.core.instances.tables import IdTable
+from sceneprior.core.id_tables import IdTable, read_mask
 
 
 class MaskPixels:

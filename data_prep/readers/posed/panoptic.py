@@ -15,13 +15,12 @@ from pydantic import BaseModel, ConfigDict, Field
 from data_prep.readers.posed.labels import PANOPTIC, find_table
 from data_prep.readers.posed.mask_format import MaskFormat
 from data_prep.readers.posed.recording import INSTANCES, PosedFrame
+from sceneprior.core.checked import checked
 from sceneprior.core.classes import STUFF, label_set
+from sceneprior.core.coco import CROWD
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
-from sceneprior.core.instances.checked import checked
-from sceneprior.core.instances.coco import CROWD
-from sceneprior.core.instances.pngs import mask_size, read_rgb
-from sceneprior.core.instances.tables import LARGEST_ID, stuff_of, tidy
+from sceneprior.core.id_tables import LARGEST_ID, mask_size, read_rgb, stuff_of, tidy
 
 _BACKGROUND = "background"
 

@@ -11,8 +11,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from data_prep.readers.posed.recording import Camera, Number
+from sceneprior.core.checked import checked
 from sceneprior.core.files import read_json
-from sceneprior.core.instances.checked import checked
 
 KEYFRAMES = ("keyframes/corrected_cameras", "keyframes/cameras")
 """Folders of optimized poses, for undistorted pictures, and of ARKit's poses, for originals."""

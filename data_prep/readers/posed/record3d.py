@@ -15,9 +15,9 @@ from pydantic import BaseModel, Field
 from scipy.spatial.transform import Rotation
 
 from data_prep.readers.posed.recording import Camera, Number
+from sceneprior.core.checked import checked
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
-from sceneprior.core.instances.checked import checked
 
 FILES = ("metadata", "metadata.json", "EXR_RGBD/metadata", "EXR_RGBD/metadata.json")
 """Names of the JSON in an unpacked .r3d file, and in an export of EXRs and pictures."""

@@ -10,8 +10,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from data_prep.readers.posed.lens import Lens
 from sceneprior.core.cameras import odd_field_of_view
+from sceneprior.core.checked import plain, shown
 from sceneprior.core.errors import InputError
-from sceneprior.core.instances.checked import plain, shown
 
 INSTANCES = "instances"
 _PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".exr", ".tif", ".tiff", ".bmp", ".heic")

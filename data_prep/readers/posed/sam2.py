@@ -13,10 +13,9 @@ import numpy as np
 from data_prep.readers.posed.labels import find_table
 from data_prep.readers.posed.mask_format import MaskFormat, instead
 from data_prep.readers.posed.recording import PosedFrame
+from sceneprior.core.coco import paint
 from sceneprior.core.errors import InputError
-from sceneprior.core.instances.coco import paint
-from sceneprior.core.instances.pngs import mask_size, read_mask
-from sceneprior.core.instances.tables import LARGEST_ID, read_class_table
+from sceneprior.core.id_tables import LARGEST_ID, mask_size, read_class_table, read_mask
 
 PLACES = ("masks", ".")
 """Possible parents of the objects' folders, within a room's folder."""

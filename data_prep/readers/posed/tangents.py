@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from scipy.spatial import ConvexHull
 
-from sceneprior.core.instances.observations import TOUCH_PX, Observations
+from sceneprior.core.observations import TOUCH_PX, Observations
 
 PAIRS_AT_MOST = 20_000
 """Maximum number of pairs of masks; if there are more, they are thinned evenly."""

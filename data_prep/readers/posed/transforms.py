@@ -27,9 +27,9 @@ from data_prep.readers.posed.recording import (
     ids_path,
     path_text,
 )
+from sceneprior.core.checked import checked, number_array, shown
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
-from sceneprior.core.instances.checked import checked, number_array, shown
 
 FILE_NAME = "transforms.json"
 

@@ -8,7 +8,7 @@ from data_prep.readers.posed.recording import PosedFrame
 from data_prep.tracks.associate import UNKNOWN, FrameMasks, Tracks, associate
 from sceneprior.core.classes import VOID
 from sceneprior.core.errors import InputError
-from sceneprior.core.instances.tables import LARGEST_ID, IdTable
+from sceneprior.core.id_tables import LARGEST_ID, IdTable
 
 
 class UntrackedMasks:

@@ -15,9 +15,9 @@ from data_prep.readers.posed.mask_format import MaskFormat
 from data_prep.readers.posed.masks import RoomMasks
 from data_prep.readers.posed.recording import PosedFrame, Recording, room_name
 from data_prep.readers.posed.untracked import UntrackedMasks, track
+from sceneprior.core.checked import shown
 from sceneprior.core.errors import InputError
-from sceneprior.core.instances.checked import shown
-from sceneprior.core.instances.observations import Observations, observe
+from sceneprior.core.observations import Observations, observe
 from sceneprior.core.shards import thinned_stuff
 
 TRACKS = ("given", "auto")

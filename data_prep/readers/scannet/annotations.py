@@ -8,9 +8,9 @@ import numpy as np
 from pydantic import BaseModel, Field
 
 from data_prep.readers.frames import is_pose, pose_fault
+from sceneprior.core.checked import checked
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
-from sceneprior.core.instances.checked import checked
 from sceneprior.core.scene import Mesh
 
 _M = TypeVar("_M", bound=BaseModel)

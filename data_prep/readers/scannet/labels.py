@@ -6,7 +6,7 @@ from pathlib import Path
 
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.instances.tables import stuff_of
+from sceneprior.core.id_tables import stuff_of
 
 LABEL_SET = "scannet"
 SHELL = frozenset(

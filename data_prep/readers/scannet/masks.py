@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from sceneprior.core.checked import plain, shown
 from sceneprior.core.errors import InputError
-from sceneprior.core.instances.checked import plain, shown
-from sceneprior.core.instances.pngs import png_kind
+from sceneprior.core.id_tables import png_kind
 
 MASK_FILES = {"filt": "_2d-instance-filt.zip", "raw": "_2d-instance.zip"}
 """Suffix of the archive's name, after the scan's, for each value of `--masks`."""

@@ -26,8 +26,8 @@ from data_prep.readers.scannet.annotations import (
 from data_prep.readers.scannet.labels import Labels
 from data_prep.readers.scannet.masks import MASK_FILES, MaskArchive
 from data_prep.readers.scannet.sens import read_recording
+from sceneprior.core.checked import plain, shown
 from sceneprior.core.errors import InputError
-from sceneprior.core.instances.checked import plain, shown
 from sceneprior.core.scene import Mesh
 
 FULL_SIZE = (968, 1296)

@@ -9,7 +9,7 @@ from data_prep.readers.scannet.masks import MaskArchive
 from data_prep.readers.scannet.occlusion import unoccluded
 from data_prep.readers.scannet.scans import Scan
 from sceneprior.core.classes import label_set
-from sceneprior.core.instances.observations import observe
+from sceneprior.core.observations import observe
 from sceneprior.core.scene import Mesh
 from sceneprior.core.shards import RoomGroundTruth, thinned_stuff
 

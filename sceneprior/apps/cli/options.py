@@ -8,7 +8,7 @@ import typer
 
 from sceneprior.apps.cli.messages import rooms_in_words
 from sceneprior.core.errors import InputError
-from sceneprior.core.seeds import LARGEST_SEED
+from sceneprior.core.repeatable import LARGEST_SEED
 
 if TYPE_CHECKING:
     from sceneprior.core.scene import Scene

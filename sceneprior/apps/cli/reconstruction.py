@@ -64,9 +64,9 @@ def reconstruct(
     from sceneprior.apps.reconstruction.export import write_page, write_reconstructions
     from sceneprior.apps.reconstruction.own_image import read_own_image
     from sceneprior.apps.reconstruction.reconstruct import OBJECTS
+    from sceneprior.core.boxes import QUARTERS
     from sceneprior.core.errors import InputError
     from sceneprior.core.files import check_free
-    from sceneprior.core.geometry.turns import QUARTERS
     from sceneprior.core.observed_image import image_from_shards, images_of_split
 
     ways = [mask is not None, room is not None, split is not None]

@@ -6,7 +6,7 @@ from typing import Literal
 from pydantic import Field, field_validator, model_validator
 
 from sceneprior.core.errors import ConfigError, InputError
-from sceneprior.core.seeds import LARGEST_SEED
+from sceneprior.core.repeatable import LARGEST_SEED
 from sceneprior.core.settings import Section, check_settings, read_settings
 
 EVERY = "every"

@@ -10,9 +10,9 @@ from jaxtyping import Int
 
 from sceneprior.core.cameras import boxes_of_points
 from sceneprior.core.classes import VOID, label_set
-from sceneprior.core.data.dataset import ViewDataset, allowed_views
+from sceneprior.core.dataset import ViewDataset, allowed_views
 from sceneprior.core.errors import InputError
-from sceneprior.core.geometry.meshes import place
+from sceneprior.core.meshes import place
 from sceneprior.core.scene import Scene
 from sceneprior.core.shards import iterate_rooms, list_shards
 from sceneprior.core.views import SceneViews

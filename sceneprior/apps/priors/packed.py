@@ -25,10 +25,10 @@ from safetensors.torch import save as tensors_to_bytes
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
+from sceneprior.core.boxes import QUARTERS
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import json_text, write_whole
-from sceneprior.core.geometry.turns import QUARTERS
 from sceneprior.core.parts import KINDS
 from sceneprior.core.settings import Section, check_settings
 from sceneprior.lifted.config import TrainedLifted

@@ -8,16 +8,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sceneprior.core.boxes import QUARTERS, quarter_rotation
 from sceneprior.core.cameras import camera_at, camera_centers, odd_field_of_view
+from sceneprior.core.checked import number_array
 from sceneprior.core.classes import label_set
+from sceneprior.core.coco import read_coco
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
-from sceneprior.core.geometry.turns import QUARTERS, quarter_rotation
-from sceneprior.core.instances.checked import number_array
-from sceneprior.core.instances.coco import read_coco
-from sceneprior.core.instances.observations import observe
-from sceneprior.core.instances.pngs import read_mask
-from sceneprior.core.instances.tables import IdTable, read_class_table, tidy
+from sceneprior.core.id_tables import IdTable, read_class_table, read_mask, tidy
+from sceneprior.core.observations import observe
 from sceneprior.core.observed_image import ObservedImage
 from sceneprior.core.shards import thinned
 

@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from sceneprior.core.boxes import box_corners
 from sceneprior.core.cameras import boxes_of_points
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.geometry.corners import box_corners
 from sceneprior.core.observed_image import ObservedImage, as_views, rows_of
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.views import SceneViews

@@ -20,8 +20,8 @@ from sceneprior.apps.retrieval.model_folders import ModelFiles, find_models
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import file_stamp, write_whole
-from sceneprior.core.geometry.surfaces import surface_points
 from sceneprior.core.scene import Mesh, Textured
+from sceneprior.core.surfaces import surface_points
 from sceneprior.furniture.catalog import Model, furniture_classes, make_variants
 
 POINTS = 1024

@@ -21,9 +21,9 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from sceneprior.apps.retrieval.cad_models import CadModels, ClassModels, made_models
-from sceneprior.core.geometry.surfaces import chamfer_mean, surface_points
-from sceneprior.core.geometry.turns import QUARTERS, quarter_rotation
+from sceneprior.core.boxes import QUARTERS, quarter_rotation
 from sceneprior.core.scene import Mesh, Scene, SceneObject, quarter_turned
+from sceneprior.core.surfaces import chamfer_mean, surface_points
 from sceneprior.render.appearance import box_mesh
 
 STANDS_M = 1.0

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sceneprior.apps.viewer.latent_map import LatentMap
-from sceneprior.core.geometry.corners import BOX_EDGES, box_corners
+from sceneprior.core.boxes import BOX_EDGES, box_corners
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.core.shell import ShellName, shell_meshes, shell_of
 from sceneprior.render.appearance import object_colors, object_mesh, shell_color

@@ -28,7 +28,7 @@ from sceneprior.baselines.gan.semantic_maps import (
     observed_maps,
     rendered_maps,
 )
-from sceneprior.core.data.dataset import ViewDataset
+from sceneprior.core.dataset import ViewDataset
 from sceneprior.core.views import DecodedScenes, SceneViews
 from sceneprior.paper.layout_decoder import LayoutDecoder
 from sceneprior.paper.prior import ModelConfig, PriorConfig

@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from sceneprior.core.boxes import QUARTERS, turn_vectors
 from sceneprior.core.cameras import camera_centers
-from sceneprior.core.geometry.turns import QUARTERS, turn_vectors
 from sceneprior.core.views import SceneViews
 
 CROP = 32

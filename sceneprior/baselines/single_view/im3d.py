@@ -41,9 +41,9 @@ from sceneprior.baselines.single_view.total3d import (
     true_objects,
 )
 from sceneprior.baselines.single_view.truth import CELLS, TrueViews
-from sceneprior.core.geometry.isosurface import surface_of
-from sceneprior.core.geometry.turns import turn_vectors
+from sceneprior.core.boxes import turn_vectors
 from sceneprior.core.scene import Mesh
+from sceneprior.core.surfaces import surface_of
 from sceneprior.paper.layers import mlp
 from sceneprior.training.steps import full_precision
 

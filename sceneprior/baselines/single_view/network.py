@@ -20,7 +20,7 @@ from sceneprior.baselines.single_view.detections import (
     Detections,
     detections_of,
 )
-from sceneprior.core.data.dataset import ViewDataset
+from sceneprior.core.dataset import ViewDataset
 from sceneprior.core.scene import Mesh
 from sceneprior.core.settings import Section
 from sceneprior.core.views import SceneViews

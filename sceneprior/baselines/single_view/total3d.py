@@ -28,7 +28,7 @@ from sceneprior.baselines.single_view.network import (
     meshes_of,
 )
 from sceneprior.baselines.single_view.truth import TrueViewDataset, TrueViews
-from sceneprior.core.geometry.corners import box_corners
+from sceneprior.core.boxes import box_corners
 from sceneprior.core.scene import Mesh
 from sceneprior.paper.shape_decoder import ShapeDecoder, ShapeDecoderConfig
 from sceneprior.training.steps import full_precision

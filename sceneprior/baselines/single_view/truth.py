@@ -13,10 +13,10 @@ from jaxtyping import Bool, Float, Int16
 from torch import Tensor
 
 from sceneprior.baselines.true_boxes import check_ground_truth
-from sceneprior.core.data.dataset import ViewDataset
-from sceneprior.core.geometry.surfaces import surface_points
+from sceneprior.core.dataset import ViewDataset
 from sceneprior.core.ground_truth import reference_scene
 from sceneprior.core.shards import iterate_rooms
+from sceneprior.core.surfaces import surface_points
 from sceneprior.core.views import SceneViews
 from sceneprior.render.appearance import object_mesh
 

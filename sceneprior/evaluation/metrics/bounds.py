@@ -4,9 +4,9 @@ import numpy as np
 import shapely
 from jaxtyping import Bool
 
-from sceneprior.core.geometry.surfaces import surface_points
 from sceneprior.core.outline import floor_polygon
 from sceneprior.core.scene import Scene
+from sceneprior.core.surfaces import surface_points
 from sceneprior.evaluation.metric import USED, Counts, Metric
 from sceneprior.evaluation.surfaces import FLUSH_M, own_box, triangles_of
 

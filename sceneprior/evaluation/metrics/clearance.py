@@ -6,7 +6,7 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
-from sceneprior.core.geometry.turns import yaw_rotation
+from sceneprior.core.boxes import yaw_rotation
 from sceneprior.core.outline import floor_polygon
 from sceneprior.core.scene import Opening, Scene
 from sceneprior.evaluation.metric import USED, Counts, Metric

@@ -7,8 +7,8 @@ import shapely
 import trimesh
 from jaxtyping import Float
 
+from sceneprior.core.boxes import yaw_rotation
 from sceneprior.core.errors import InputError
-from sceneprior.core.geometry.turns import yaw_rotation
 from sceneprior.core.scene import Mesh
 
 POINTS = 10_000

@@ -43,7 +43,7 @@ def settle(scene: Scene, seconds: float = SECONDS) -> Settled:
     Source:
         The stability of nepfaff/SceneEval: 5 s, and an object is stable if it moved at most 1 cm
         and turned at most 0.1 rad. There, every object weighs 1 kg; here, masses are those of
-        `core/masses.py`.
+        `core/colliders.py`.
     """
     mujoco = _mujoco()
     model = mujoco.MjModel.from_xml_string(scene_to_mjcf(scene))

@@ -4,8 +4,8 @@ import numpy as np
 import shapely
 from jaxtyping import Bool, Float
 
+from sceneprior.core.boxes import yaw_rotation
 from sceneprior.core.colliders import support_of
-from sceneprior.core.geometry.turns import yaw_rotation
 from sceneprior.core.outline import floor_rectangle, rectangle
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.evaluation.metric import USED, Counts, Metric

@@ -10,10 +10,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
+from sceneprior.core.boxes import turn_boxes
 from sceneprior.core.classes import VOID
-from sceneprior.core.data.dataset import BLANK, RoomDataset, allowed_views
+from sceneprior.core.dataset import BLANK, RoomDataset, allowed_views
 from sceneprior.core.errors import ShardError
-from sceneprior.core.geometry.turns import turn_boxes
 from sceneprior.core.parts import filled_cells
 from sceneprior.core.shards import RoomViews, Shard
 from sceneprior.core.views import LiftedRooms

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from rich.console import Console
 from rich.progress import track
 
-from sceneprior.core.geometry.turns import quarter_rotation
+from sceneprior.core.boxes import quarter_rotation
 from sceneprior.core.parts import Parts
 from sceneprior.lifted.lifting import RayPool
 from sceneprior.lifted.lifting.part_fit import fit_parts

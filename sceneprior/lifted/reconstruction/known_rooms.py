@@ -16,11 +16,10 @@ from torch import Tensor
 from torch.nn import functional as F
 from torch.nn.utils.rnn import pad_sequence
 
+from sceneprior.core.boxes import QUARTERS, box_corners, quarter_rotation
 from sceneprior.core.cameras import Pinhole, boxes_of_points
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.geometry.corners import box_corners
-from sceneprior.core.geometry.turns import QUARTERS, quarter_rotation
 from sceneprior.core.ground_truth import reference_scene
 from sceneprior.core.observed_image import ObservedImage, as_views, rows_of
 from sceneprior.core.scene import Mesh, Scene, SceneObject

@@ -13,10 +13,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from sceneprior.core.boxes import QUARTERS, turn_vectors
 from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.geometry.meshes import beveled_cube, icosphere
-from sceneprior.core.geometry.turns import QUARTERS, turn_vectors
+from sceneprior.core.meshes import beveled_cube, icosphere
 from sceneprior.core.observed_image import ObservedImage
 from sceneprior.core.overlaps import box_iou_3d
 from sceneprior.core.scene import Scene, SceneObject

@@ -9,9 +9,8 @@ import numpy as np
 
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
+from sceneprior.core.repeatable import check_seed, single_threaded
 from sceneprior.core.scene import Opening, Scene
-from sceneprior.core.seeds import check_seed
-from sceneprior.core.threads import single_threaded
 from sceneprior.lifted.config import TrainedLifted
 from sceneprior.lifted.requests.draw import Answer, draw_requested
 from sceneprior.lifted.requests.relation_checks import RelationChecks, furniture_in

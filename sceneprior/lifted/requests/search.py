@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sceneprior.core.geometry.turns import QUARTERS
+from sceneprior.core.boxes import QUARTERS
 from sceneprior.core.mixtures import draw_index
 from sceneprior.lifted.prototypes import turn_posed
 from sceneprior.lifted.requests.placement_rules import PlacementRules

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from sceneprior.core.geometry.turns import QUARTERS, turn_boxes
+from sceneprior.core.boxes import QUARTERS, turn_boxes
 from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.prototypes import POSES, turn_posed
 from sceneprior.lifted.sampler.rooms import gaps_to_sides_m, own_sides, rectangles_of

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from sceneprior.core.geometry.turns import QUARTERS
+from sceneprior.core.boxes import QUARTERS
 from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.prototypes import Prototypes
 from sceneprior.lifted.sampler.frames import FURTHEST_M, gaps_by_side, mean_by_prototype, own_sides

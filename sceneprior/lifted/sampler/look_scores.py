@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from sceneprior.core.geometry.turns import QUARTERS
+from sceneprior.core.boxes import QUARTERS
 from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.prototypes import POSES
 from sceneprior.lifted.sampler.contents import MANY

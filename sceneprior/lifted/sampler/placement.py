@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from sceneprior.core.geometry.turns import QUARTERS
+from sceneprior.core.boxes import QUARTERS
 from sceneprior.core.mixtures import FIRST_SCALE, LogisticMixture
 from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.prototypes import PARTS

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from sceneprior.core.geometry.turns import QUARTERS
+from sceneprior.core.boxes import QUARTERS
 from sceneprior.core.mixtures import LogisticMixture
 from sceneprior.lifted.sampler.frames import turn_places
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from sceneprior.core.geometry.turns import QUARTERS, turn_boxes
+from sceneprior.core.boxes import QUARTERS, turn_boxes
 from sceneprior.core.views import RoomBoxes
 from sceneprior.core.wall_lines import Wall
 from sceneprior.lifted.lifting.dataset import LiftedDataset

@@ -15,10 +15,10 @@ from sceneprior.apps.experiments.evaluate_views import mask_iou_of_rooms, mask_s
 from sceneprior.apps.rooms import write_scenes
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.classes import label_set
-from sceneprior.core.data.dataset import ViewDataset, allowed_views
+from sceneprior.core.dataset import ViewDataset, allowed_views
 from sceneprior.core.errors import InputError
-from sceneprior.core.geometry.meshes import place
 from sceneprior.core.ground_truth import reference_scenes
+from sceneprior.core.meshes import place
 from sceneprior.core.shards import iterate_rooms
 from sceneprior.core.views import DecodedScenes
 from sceneprior.evaluation.metrics.contents import category_kl, class_frequencies

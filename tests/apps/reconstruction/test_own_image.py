@@ -18,7 +18,7 @@ from sceneprior.apps.reconstruction.own_image import (
 )
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.instances.tables import tidy
+from sceneprior.core.id_tables import tidy
 from sceneprior.core.observed_image import images_of_split
 
 LABELS = "front3d_bedroom"

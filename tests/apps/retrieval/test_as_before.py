@@ -8,7 +8,7 @@ from model_folder import blocks, corner_sofa, write_models
 
 from sceneprior.apps.retrieval.cad_models import made_models, open_models
 from sceneprior.apps.retrieval.retrieve import retrieval_report, retrieve, retrieve_all
-from sceneprior.core.geometry.turns import quarter_rotation
+from sceneprior.core.boxes import quarter_rotation
 from sceneprior.core.scene import Mesh, Scene, SceneObject, quarter_turned
 
 BED = ((0, 0.3, 0), (1.8, 0.6, 2)), ((0, 0.9, -0.95), (1.8, 0.6, 0.1))

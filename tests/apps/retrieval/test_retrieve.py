@@ -16,8 +16,8 @@ from sceneprior.apps.retrieval.retrieve import (
     retrieve,
     retrieve_all,
 )
-from sceneprior.core.geometry.surfaces import surface_points
 from sceneprior.core.scene import Mesh, Scene, SceneObject, Turned, bound_m, quarter_turned
+from sceneprior.core.surfaces import surface_points
 
 POINTS = 256
 

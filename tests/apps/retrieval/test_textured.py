@@ -14,10 +14,10 @@ from sceneprior.apps.retrieval.cad_models import open_models
 from sceneprior.apps.retrieval.model_folders import read_textured
 from sceneprior.apps.retrieval.retrieve import retrieve
 from sceneprior.apps.rooms import write_scenes
+from sceneprior.core.boxes import quarter_rotation
 from sceneprior.core.colliders import closed_components
+from sceneprior.core.contact_resolution import add_supports
 from sceneprior.core.errors import InputWarning
-from sceneprior.core.feet import with_feet
-from sceneprior.core.geometry.turns import quarter_rotation
 from sceneprior.core.scene import Mesh, Scene, SceneObject, quarter_turned
 from sceneprior.interchange.export import export_scenes
 from sceneprior.render.model_files import LARGEST_PX
@@ -148,7 +148,7 @@ def test_parts_follow_their_object_and_feet_are_parts(models):
     raised = Mesh(np.add(sofa.mesh.vertices_m, [0, 0.5, 0]), sofa.mesh.faces)
     leg = trimesh.creation.box(bounds=[[0.45, 0, -0.25], [0.55, 0.6, -0.15]])
     solids = (raised, Mesh(leg.vertices, leg.faces))
-    standing = with_feet(replace(sofa, solids=solids))
+    standing = add_supports(replace(sofa, solids=solids))
     assert len(standing.textured) > len(sofa.textured) and standing.textured[-1].material is None
 
 

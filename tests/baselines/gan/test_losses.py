@@ -18,7 +18,7 @@ from sceneprior.baselines.gan.losses import (
     diversity_loss,
 )
 from sceneprior.core.cameras import camera_centers
-from sceneprior.core.data.dataset import ViewDataset
+from sceneprior.core.dataset import ViewDataset
 from sceneprior.core.views import DecodedScenes
 
 

@@ -17,8 +17,8 @@ from sceneprior.baselines.gan.semantic_maps import (
     rendered_maps,
 )
 from sceneprior.core.classes import VOID
-from sceneprior.core.data.dataset import ViewDataset
-from sceneprior.core.geometry.meshes import place
+from sceneprior.core.dataset import ViewDataset
+from sceneprior.core.meshes import place
 from sceneprior.core.shards import iterate_rooms
 from sceneprior.core.views import DecodedScenes
 from sceneprior.paper.losses import kept_objects

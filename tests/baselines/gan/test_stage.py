@@ -9,7 +9,7 @@ from sceneprior.apps.reconstruction.reconstruct import FitOptions, reconstruct
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.baselines.gan.semantic_maps import observed_maps
 from sceneprior.baselines.gan.stage import GanStage
-from sceneprior.core.data.dataset import ViewDataset
+from sceneprior.core.dataset import ViewDataset
 from sceneprior.core.errors import InputError
 from sceneprior.paper.decode import decode_training_rooms
 from sceneprior.paper.sampling import read_latent

@@ -23,7 +23,7 @@ from sceneprior.baselines.single_view.total3d import (
     true_objects,
 )
 from sceneprior.baselines.single_view.truth import TrueViewDataset, filled
-from sceneprior.core.geometry.meshes import icosphere
+from sceneprior.core.meshes import icosphere
 
 METHODS = ("total3d", "im3d")
 

@@ -7,8 +7,8 @@ import torch
 from torch.testing import assert_close
 
 from sceneprior.baselines.single_view.detections import CROP, detections_of, some_views
-from sceneprior.core.data.dataset import ViewDataset
-from sceneprior.core.geometry.turns import turn_vectors
+from sceneprior.core.boxes import turn_vectors
+from sceneprior.core.dataset import ViewDataset
 from sceneprior.core.views import SceneViews
 
 

@@ -8,7 +8,7 @@ from tiny_runs import tiny_baseline
 
 from sceneprior.baselines.single_view.detections import detections_of, some_views
 from sceneprior.baselines.single_view.usl import other_view_losses, silhouette_loss
-from sceneprior.core.data.dataset import ViewDataset
+from sceneprior.core.dataset import ViewDataset
 from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.overlaps import box_iou_3d
 

@@ -15,7 +15,7 @@ from data_prep.inspection.pictures import (
     draw_view,
     wire_pixels,
 )  # fmt: skip
-from sceneprior.core.geometry.corners import BOX_EDGES, box_corners
+from sceneprior.core.boxes import BOX_EDGES, box_corners
 from sceneprior.core.shards import Shard, list_shards
 
 K = np.array([[100.0, 0, 60], [0, 100, 45], [0, 0, 1]])

@@ -14,8 +14,8 @@ from data_prep.engine.build import Job, build_shards
 from data_prep.inspection.sheet import draw_sheet, legend
 from data_prep.inspection.tables import count_tables, room_table
 from data_prep.readers.posed.source import PosedSource
+from sceneprior.core.boxes import yaw_rotation
 from sceneprior.core.errors import InputError
-from sceneprior.core.geometry.turns import yaw_rotation
 
 
 @pytest.fixture

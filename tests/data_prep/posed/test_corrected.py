@@ -9,7 +9,7 @@ from untracked_room import furnished
 from data_prep.readers.frames import room_cameras
 from data_prep.readers.posed.corrected import _adjusted, _gaps, correct, moved_cameras
 from data_prep.readers.posed.tangents import find_outlines
-from sceneprior.core.instances.observations import observe
+from sceneprior.core.observations import observe
 
 DEGREES, METRES = 0.5, 0.01
 

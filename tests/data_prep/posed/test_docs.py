@@ -38,7 +38,7 @@ def test_the_example_runs_as_printed(tmp_path, monkeypatch):
 def test_every_key_that_is_read_is_in_the_document():
     from data_prep.readers.posed import transforms
     from data_prep.readers.posed.recording import Camera
-    from sceneprior.core.instances import tables
+    from sceneprior.core import id_tables
 
     text = DOCUMENT.read_text()
     keys = {word for key in re.findall(r"`([^`]+)`", transforms.__doc__) for word in key.split()}
@@ -46,5 +46,5 @@ def test_every_key_that_is_read_is_in_the_document():
     for word in keys | set(Camera.model_fields):
         spelt = f"`{word}`" if not re.fullmatch(r"k[23]", word) else "`k1` to `k4`"
         assert spelt in text, word
-    for name in tables.SHELL:
+    for name in id_tables.SHELL:
         assert f"`{name}`" in text

@@ -5,7 +5,7 @@ import pytest
 from data_prep.readers.posed.labels import find_table, read_label_set
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.instances.tables import read_class_table
+from sceneprior.core.id_tables import read_class_table
 
 
 def table(folder, text, name="classes.json"):

@@ -14,7 +14,7 @@ from data_prep.engine.source import RoomTask
 from data_prep.engine.workers import pool
 from data_prep.readers.posed.source import PosedSource, find_rooms
 from data_prep.readers.posed.views import PosedSettings
-from sceneprior.core.data.dataset import ViewDataset
+from sceneprior.core.dataset import ViewDataset
 from sceneprior.core.errors import InputError
 from sceneprior.core.ground_truth import reference_scenes
 

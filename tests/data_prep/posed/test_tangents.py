@@ -7,7 +7,7 @@ from untracked_room import frames, furnished
 
 from data_prep.readers.posed import tangents
 from data_prep.readers.posed.tangents import find_outlines, hull_corners, measure_gaps
-from sceneprior.core.instances.observations import observe
+from sceneprior.core.observations import observe
 
 
 @pytest.fixture

@@ -11,9 +11,9 @@ from data_prep.inspection.checks import array_problems, mask_problems
 from data_prep.readers.posed.cameras import cameras_in_room, seems_up, upright_cameras
 from data_prep.readers.posed.transforms import read_recording
 from data_prep.readers.posed.views import PosedSettings
+from sceneprior.core.boxes import quarter_rotation, yaw_rotation
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.geometry.turns import quarter_rotation, yaw_rotation
 
 
 @pytest.fixture

@@ -26,8 +26,8 @@ from data_prep.readers.heading import turn_matrix
 from data_prep.readers.rooms import FramedRoom, prepare_room
 from data_prep.readers.source import PublicSource, open_reader
 from data_prep.readers.upright import own_sides
+from sceneprior.core.boxes import quarter_rotation
 from sceneprior.core.classes import STUFF, label_set
-from sceneprior.core.geometry.turns import quarter_rotation
 from sceneprior.core.ground_truth import reference_scenes
 
 NAMES = label_set("scannet")

@@ -8,8 +8,8 @@ import trimesh
 from scipy.spatial.distance import cdist
 
 from sceneprior.core.errors import InputError
-from sceneprior.core.geometry.surfaces import chamfer_of, nearest_distances
 from sceneprior.core.scene import Mesh
+from sceneprior.core.surfaces import chamfer_of, nearest_distances
 from sceneprior.evaluation.metrics.mesh_metrics import (
     OrientedBox,
     f_score,

@@ -5,8 +5,8 @@ import pytest
 from rooms_of_solids import solid_box
 
 from sceneprior.apps.api import load
+from sceneprior.core.contact_resolution import make_stable
 from sceneprior.core.scene import Scene, SceneObject, Solid
-from sceneprior.core.standing import stand
 from sceneprior.evaluation.metrics.stability import settle, stable_count
 
 pytest.importorskip("mujoco", reason="no mujoco here: pip install -e '.[sim]'")
@@ -37,7 +37,7 @@ def test_overlaps_at_the_start_are_measured():
 @pytest.mark.parametrize("name", ["procthor-bedroom", "procthor-living", "demo-bedroom"])
 def test_rooms_of_shipped_priors_stand_still(name):
     """8 rooms of each prior: at least 97% of objects stay, and nothing overlaps at the start."""
-    rooms = [stand(room)[0] for room in load(name).sample(8, seed=1)]
+    rooms = [make_stable(room)[0] for room in load(name).sample(8, seed=1)]
     found = [settle(room) for room in rooms]
     assert max(one.penetration_m for one in found) <= 1e-3
     stable = np.concatenate([one.stable for one in found])

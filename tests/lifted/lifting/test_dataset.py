@@ -11,10 +11,10 @@ import torch
 from rooms_of_walls import L_SHAPE, shell_room
 from toy_rooms import LABEL_SET, write_shard
 
+from sceneprior.core.boxes import turn_boxes, turn_grids
 from sceneprior.core.classes import VOID
-from sceneprior.core.data.dataset import BLANK, ViewDataset, allowed_views
+from sceneprior.core.dataset import BLANK, ViewDataset, allowed_views
 from sceneprior.core.errors import ShardError
-from sceneprior.core.geometry.turns import turn_boxes, turn_grids
 from sceneprior.core.parts import whole_box
 from sceneprior.core.shards import iterate_rooms
 from sceneprior.core.wall_lines import find_walls

@@ -5,7 +5,6 @@ import pytest
 import trimesh
 from parts_of_rooms import CORNER, TABLE, boxes, rays_of
 
-from sceneprior.core.geometry.part_meshes import surface_of_parts
 from sceneprior.core.parts import (
     ACROSS_X,
     BOX,
@@ -14,6 +13,7 @@ from sceneprior.core.parts import (
     MOST_PARTS,
     Parts,
     filled_cells,
+    surface_of_parts,
 )
 from sceneprior.lifted.lifting import RayPool
 from sceneprior.lifted.lifting.outlines import area_table

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from parts_of_rooms import CORNER, TABLE, rays_of
 
-from sceneprior.core.geometry.turns import turn_grids
+from sceneprior.core.boxes import turn_grids
 from sceneprior.core.parts import filled_cells
 from sceneprior.lifted.lifting import RayPool
 from sceneprior.lifted.lifting.prototype_fitting import as_prototype, explain_rays, fit_prototypes

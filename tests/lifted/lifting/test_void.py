@@ -9,7 +9,7 @@ from toy_rooms import look_at
 
 from sceneprior.core.cameras import Pinhole
 from sceneprior.core.classes import VOID
-from sceneprior.core.instances.observations import observe
+from sceneprior.core.observations import observe
 from sceneprior.core.parts import filled_cells
 from sceneprior.core.scene import Mesh
 from sceneprior.lifted.lifting import RayPool, ShapeGrid

@@ -10,7 +10,7 @@ from torch.testing import assert_close
 from sceneprior.apps.config import load_run
 from sceneprior.apps.reconstruction.own_image import level_camera
 from sceneprior.core.errors import InputError
-from sceneprior.core.geometry.meshes import icosphere
+from sceneprior.core.meshes import icosphere
 from sceneprior.core.observed_image import ObservedImage
 from sceneprior.lifted.reconstruction import objects as candidates
 from sceneprior.lifted.reconstruction.objects import (

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from sceneprior.core.geometry.turns import QUARTERS, turn_boxes
+from sceneprior.core.boxes import QUARTERS, turn_boxes
 from sceneprior.core.parts import whole_box
 from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.prototypes import Prototypes, turn_posed

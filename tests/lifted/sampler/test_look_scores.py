@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from sceneprior.core.geometry.turns import QUARTERS
+from sceneprior.core.boxes import QUARTERS
 from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.prototypes import POSES, turn_posed
 from sceneprior.lifted.sampler.contents import MANY

@@ -8,7 +8,7 @@ import torch
 from rooms_of_boxes import sampler_rooms, small_sampler
 from torch.testing import assert_close
 
-from sceneprior.core.geometry.turns import QUARTERS
+from sceneprior.core.boxes import QUARTERS
 from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.prototypes import turn_posed
 from sceneprior.lifted.sampler.contents import END

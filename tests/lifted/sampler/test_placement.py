@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from sceneprior.core.geometry.turns import QUARTERS, turn_boxes
+from sceneprior.core.boxes import QUARTERS, turn_boxes
 from sceneprior.core.mixtures import LogisticMixture
 from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.prototypes import POSES, turn_posed

@@ -9,7 +9,7 @@ import torch
 from rooms_of_boxes import CLASSES, lifted_rooms, sampler_rooms
 from torch.testing import assert_close
 
-from sceneprior.core.geometry.turns import turn_boxes
+from sceneprior.core.boxes import turn_boxes
 from sceneprior.core.views import RoomBoxes
 from sceneprior.core.wall_lines import Wall
 from sceneprior.lifted.lifting.dataset import LiftedDataset

@@ -10,13 +10,13 @@ from tiny_runs import tiny_lifted, tiny_sampler_config
 from torch import nn
 
 from sceneprior.apps.config import load_any_run
-from sceneprior.core.data.datamodule import make_loader
 from sceneprior.core.errors import ConfigError
 from sceneprior.lifted.sampler.likelihood import negative_log_likelihood
 from sceneprior.lifted.sampler.rooms import SamplerRooms, rectangles_of
 from sceneprior.lifted.sampler.settings import SamplerConfig
 from sceneprior.lifted.sampler.stage import SamplerStage
 from sceneprior.training.fit import fit
+from sceneprior.training.loader import make_loader
 
 CPU = {"accelerator": "cpu"}
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 from toy_rooms import look_at
 
+from sceneprior.core.boxes import box_corners
 from sceneprior.core.cameras import Boxes2D, boxes_of_points
-from sceneprior.core.geometry.corners import box_corners
 from sceneprior.core.views import DecodedScenes, SceneViews
 
 COUNTS = (4, 2, 3)

@@ -6,8 +6,8 @@ import pytest
 import torch
 from references import losses as by_hand
 
+from sceneprior.core.boxes import box_corners
 from sceneprior.core.cameras import boxes_of_points
-from sceneprior.core.geometry.corners import box_corners
 from sceneprior.paper.losses import (
     box_loss,
     class_loss,

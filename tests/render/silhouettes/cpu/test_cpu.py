@@ -18,7 +18,7 @@ from silhouette_scenes import (
 from torch.testing import assert_close
 
 from sceneprior.core.cameras import project
-from sceneprior.core.geometry.meshes import icosphere
+from sceneprior.core.meshes import icosphere
 from sceneprior.render.silhouettes.cpu.threads import in_threads
 from sceneprior.render.silhouettes.cpu.windows import windows_of
 from sceneprior.render.silhouettes.reference import Settings

@@ -1,0 +1,296 @@
+"""Contacts of rooms made right for physics: objects rest on something, and none overlap.
+
+Generated rooms nearly meet these conditions, but furniture may float by a centimetre, and a lifted
+chair may lack a leg or reach into a table. The changes are counted. Furniture whose centre of mass
+lies outside its support polygon would fall over, and gets supports.
+"""
+
+import itertools
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import shapely
+from jaxtyping import Bool, Float
+
+from sceneprior.core.colliders import colliders, is_fixed, mesh_of, points_of, volume_and_centroid
+from sceneprior.core.outline import free_floor
+from sceneprior.core.scene import Mesh, Scene, SceneObject, Solid, Textured
+
+GAP_M = 2e-3
+"""Distance between objects after they are pushed apart."""
+TOUCHING_M = 5e-4
+"""Largest overlap of two bodies that is tolerated."""
+FLOOR_M = 0.3
+"""Maximum height of the lower face of objects that are always set on the floor."""
+RESTS_M = 0.15
+"""Maximum vertical distance by which an object above `FLOOR_M` is moved onto another object. If no
+object is within this distance, it is set on the floor, too."""
+SLABS = 8
+"""Number of slabs into which a body that is a mesh is cut."""
+STEP_M, REACH_M = 0.05, 2.0
+"""Spacing and range, along x and z, of the moves that are tried for an object."""
+
+Boxes = Float[np.ndarray, "_ 2 3"]
+"""Lower and upper corners of the boxes around the bodies of objects."""
+
+
+def make_stable(scene: Scene) -> tuple[Scene, Counter[str]]:
+    """Set down a scene's objects, give feet to those that would fall over, and move them apart.
+
+    Objects are set down in the order of their heights, except lamps and objects that hang on walls.
+    Then each object, the largest first, is moved to the nearest place where it overlaps no earlier
+    object and lies no further outside the floor than before.
+
+    Returns:
+        The scene, and the number of objects that were `set down`, `given feet`, `moved`, and `left
+        out` because there was no free place.
+    """
+    changes: Counter[str] = Counter()
+    # Convex parts of meshes take seconds, so they are computed once and kept as solids.
+    with_bodies = tuple(replace(item, solids=colliders(item)) for item in scene.objects)
+    objects = _set_down(with_bodies, changes)
+    objects = [item if is_fixed(item) else _on_feet(item, changes) for item in objects]
+    kept = _apart(scene, objects, changes)
+    return replace(scene, objects=tuple(kept)), changes
+
+
+def body_boxes(item: SceneObject) -> Boxes:
+    """Boxes around the bodies of an object; bodies that are meshes are cut into slabs along x."""
+    boxes = []
+    for body in colliders(item):
+        if isinstance(body, Mesh):
+            boxes += _slabs(points_of(body))
+        else:
+            boxes.append(np.array([body.low_m, body.high_m]))
+    return np.array(boxes)
+
+
+def _slabs(points: Float[np.ndarray, "points 3"]) -> list[Float[np.ndarray, "2 3"]]:
+    """Boxes around slabs of a convex body, which follow a rotated body better than one box."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    plan = shapely.convex_hull(shapely.MultiPoint(points[:, ::2]))
+    ends = np.linspace(low[0], high[0], SLABS + 1)
+    boxes = []
+    for start, end in itertools.pairwise(ends):
+        slice_ = shapely.clip_by_rect(plan, start, low[2], end, high[2])
+        if not slice_.is_empty:
+            _, near, _, far = slice_.bounds
+            boxes.append(np.array([[start, low[1], near], [end, high[1], far]]))
+    return boxes or [np.array([low, high])]
+
+
+def _set_down(objects: tuple[SceneObject, ...], changes: Counter[str]) -> list[SceneObject]:
+    """Set each object on the floor or on the object below it, the lowest first."""
+    placed = list(objects)
+    bounds = [body_boxes(item) for item in objects]
+    bottoms = np.array([each[:, 0, 1].min() for each in bounds])
+    for row in np.argsort(bottoms, kind="stable"):
+        item, bottom = objects[row], bottoms[row]
+        if is_fixed(item):
+            continue
+        height = 0.0
+        if bottom > FLOOR_M:
+            tops = [
+                boxes[:, 1, 1].max()
+                for other, boxes in enumerate(bounds)
+                if other != row and _meets_in_plan(boxes, bounds[row])
+            ]
+            height = max((top for top in tops if abs(top - bottom) <= RESTS_M), default=0.0)
+        if abs(bottom - height) > 1e-6:
+            placed[row] = item.moved((0.0, float(height - bottom), 0.0))
+            bounds[row] = bounds[row] + np.array([0.0, height - bottom, 0.0])
+            changes["set down"] += bool(abs(bottom - height) > 1e-3)
+    return placed
+
+
+def _meets_in_plan(boxes: Boxes, others: Boxes) -> bool:
+    """True if the bounding rectangles of two objects overlap, seen from above."""
+    (low, high), (other_low, other_high) = (
+        (each[:, 0, ::2].min(axis=0), each[:, 1, ::2].max(axis=0)) for each in (boxes, others)
+    )
+    return bool((np.minimum(high, other_high) - np.maximum(low, other_low) > 0).all())
+
+
+def _on_feet(item: SceneObject, changes: Counter[str]) -> SceneObject:
+    standing = add_supports(item)
+    changes["given feet"] += standing is not item
+    return standing
+
+
+def _apart(scene: Scene, objects: list[SceneObject], changes: Counter[str]) -> list[SceneObject]:
+    """Move objects apart, the largest first; objects without a free place are left out."""
+    floor = free_floor(scene)
+    kept: dict[int, SceneObject] = {}
+    taken = np.zeros((0, 2, 3))
+    order = np.argsort([-item.size_m[0] * item.size_m[2] for item in objects], kind="stable")
+    for row in order:
+        item = objects[row]
+        boxes = body_boxes(item)
+        offset = free_offset(boxes, taken, floor)
+        if offset is None:
+            changes["left out"] += 1
+            continue
+        if offset.any():
+            changes["moved"] += 1
+            item = item.moved((float(offset[0]), 0.0, float(offset[1])))
+            boxes = boxes + np.array([offset[0], 0.0, offset[1]])
+        kept[row] = item
+        taken = np.concatenate([taken, boxes])
+    return [kept[row] for row in range(len(objects)) if row in kept]
+
+
+def free_offset(
+    boxes: Boxes, taken: Boxes, floor: shapely.Geometry | None
+) -> Float[np.ndarray, "2"] | None:
+    """The shortest move along x and z after which no box overlaps a taken box, and no larger area
+    lies outside the floor; None if there is no such move within `REACH_M`."""
+    still = np.zeros((1, 2))
+    if not _overlaps(boxes, taken, still, -TOUCHING_M)[0]:
+        return still[0]
+    steps = np.arange(-REACH_M, REACH_M + STEP_M / 2, STEP_M)
+    grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    tried = np.concatenate([_flush_moves(boxes, taken), grid])
+    tried = tried[np.argsort(np.abs(tried).sum(axis=1), kind="stable")]
+    outside = _area_outside(boxes, floor, still[0])
+    for some in np.array_split(tried, max(1, len(tried) // 256)):
+        for offset in some[~_overlaps(boxes, taken, some, GAP_M / 2)]:
+            if _area_outside(boxes, floor, offset) <= outside + 1e-4:
+                return np.asarray(offset)
+    return None
+
+
+def _flush_moves(boxes: Boxes, taken: Boxes) -> Float[np.ndarray, "moves 2"]:
+    """Moves along one axis after which a box is flush with a taken box."""
+    moves = []
+    for axis in (0, 2):
+        after = taken[None, :, 1, axis] - boxes[:, None, 0, axis] + GAP_M
+        before = taken[None, :, 0, axis] - boxes[:, None, 1, axis] - GAP_M
+        along = np.concatenate([after.ravel(), before.ravel()])
+        along = np.unique(along[np.abs(along) <= REACH_M].round(4))
+        columns = [along, np.zeros_like(along)]
+        moves.append(np.stack(columns if axis == 0 else columns[::-1], axis=1))
+    return np.concatenate(moves)
+
+
+def _overlaps(
+    boxes: Boxes, taken: Boxes, offsets: Float[np.ndarray, "moves 2"], gap_m: float
+) -> Bool[np.ndarray, " moves"]:
+    """True for moves after which some box is nearer than `gap_m` to a taken box."""
+    level = np.minimum(boxes[:, None, 1, 1], taken[None, :, 1, 1]) - np.maximum(
+        boxes[:, None, 0, 1], taken[None, :, 0, 1]
+    )
+    mine, theirs = np.nonzero(level > TOUCHING_M)
+    found = np.zeros(len(offsets), bool)
+    if not len(mine):
+        return found
+    low, high = boxes[mine, 0][:, ::2], boxes[mine, 1][:, ::2]
+    other_low, other_high = taken[theirs, 0][:, ::2], taken[theirs, 1][:, ::2]
+    moves = offsets[:, None]
+    deep = np.minimum(high + moves, other_high) - np.maximum(low + moves, other_low)
+    return np.asarray((deep > -gap_m).all(axis=2).any(axis=1))
+
+
+def _area_outside(
+    boxes: Boxes, floor: shapely.Geometry | None, offset: Float[np.ndarray, "2"]
+) -> float:
+    """Area of the object's bounding rectangle, after a move, that lies outside the floor."""
+    if floor is None:
+        return 0.0
+    low, high = boxes[:, 0].min(axis=0)[::2] + offset, boxes[:, 1].max(axis=0)[::2] + offset
+    return float(shapely.box(*low, *high).difference(floor).area)
+
+
+CONTACT_M = 1e-3
+"""Height above the lowest point up to which a body touches the floor."""
+MARGIN = 0.2
+"""Minimum distance of the centre of mass from the edge of the support polygon, as a share of the
+distance of the centre of mass from the outline of the object seen from above."""
+WIDE_M = 0.05
+"""Width of a foot."""
+LOWER = 0.2
+"""Lower part of a body, as a share of its height, that a foot may support."""
+HIGH = 0.3
+"""Weight of the height of a body above the floor, relative to its horizontal distance from the
+corner, when choosing the body that a foot supports."""
+INTO_M = 0.01
+"""Length by which a foot reaches into the body above it."""
+
+
+def add_supports(item: SceneObject) -> SceneObject:
+    """The object, with feet near its four corners if it would fall over without them.
+
+    Feet are boxes, added to the object's solids and mesh. A corner near which a body already stands
+    on the floor gets none.
+    """
+    if is_stable(item):
+        return item
+    bodies = colliders(item)
+    feet = _feet(bodies)
+    mesh = item.mesh and _joined(item.mesh, *map(mesh_of, feet))
+    textured = item.textured and (*item.textured, *(Textured(mesh_of(foot)) for foot in feet))
+    return replace(item, solids=(*bodies, *feet), mesh=mesh, textured=textured)
+
+
+def is_stable(item: SceneObject) -> bool:
+    """True if the centre of mass lies inside the object's support polygon, which is the convex hull
+    of its contacts with the floor seen from above, with a margin (`MARGIN`)."""
+    bodies = colliders(item)
+    points = np.concatenate([points_of(body) for body in bodies])
+    low = points[points[:, 1] <= points[:, 1].min() + CONTACT_M][:, ::2]
+    support, plan = (
+        shapely.convex_hull(shapely.MultiPoint(each)) for each in (low, points[:, ::2])
+    )
+    volumes, centers = zip(*(volume_and_centroid(body) for body in bodies), strict=True)
+    middle = shapely.Point(np.average(np.array(centers), axis=0, weights=np.array(volumes))[::2])
+    if not support.contains(middle):
+        return False
+    return bool(middle.distance(support.exterior) >= MARGIN * middle.distance(plan.exterior))
+
+
+def _feet(bodies: tuple[Solid | Mesh, ...]) -> tuple[Solid, ...]:
+    clouds = [points_of(body) for body in bodies]
+    floor_m = min(float(points[:, 1].min()) for points in clouds)
+    every = np.concatenate(clouds)
+    low, high = every[:, ::2].min(axis=0), every[:, ::2].max(axis=0)
+    half = np.minimum(WIDE_M, (high - low) / 4) / 2
+    feet = []
+    for corner in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        at = np.where(corner, high - half, low + half)
+        place, top_m = _under(clouds, at, floor_m)
+        if top_m - floor_m <= CONTACT_M:
+            continue  # a body stands on the floor there
+        feet.append(
+            Solid(
+                "box",
+                (float(place[0] - half[0]), floor_m, float(place[1] - half[1])),
+                (float(place[0] + half[0]), top_m + INTO_M, float(place[1] + half[1])),
+            )
+        )
+    return tuple(feet)
+
+
+def _under(
+    clouds: list[Float[np.ndarray, "_ 3"]], at: Float[np.ndarray, "2"], floor_m: float
+) -> tuple[Float[np.ndarray, "2"], float]:
+    """Position (x, z) and top of the foot at a corner, `at`. The foot supports the body with the
+    lowest cost, which favours low bodies near the corner."""
+    found = []
+    for points in clouds:
+        # Only the lower part, because the rim of a round body may be as high as the object.
+        heights = points[:, 1]
+        lower = points[heights <= heights.min() + LOWER * np.ptp(heights)]
+        plan = shapely.convex_hull(shapely.MultiPoint(lower[:, ::2]))
+        nearest = shapely.get_coordinates(shapely.shortest_line(shapely.Point(at), plan))[-1]
+        cost = np.abs(nearest - at).sum() + HIGH * (heights.min() - floor_m)
+        found.append((float(cost), nearest, float(lower[:, 1].max())))
+    _, place, top_m = min(found, key=lambda one: one[0])
+    return place, top_m
+
+
+def _joined(*meshes: Mesh) -> Mesh:
+    starts = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes)])
+    return Mesh(
+        np.concatenate([mesh.vertices_m for mesh in meshes]),
+        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]),
+    )

@@ -1,1 +1,0 @@
-"""Loads view shards as batches of `SceneViews`."""

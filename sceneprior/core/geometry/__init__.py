@@ -1,1 +1,0 @@
-"""Pure functions on cameras, boxes and meshes, without weights."""

@@ -1,0 +1,196 @@
+"""Objects are set down, get feet, and go apart; nothing else changes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import shapely
+import trimesh
+from rooms_of_solids import solid_box
+
+from sceneprior.core.colliders import colliders, convex_parts, mesh_of, volume_and_centroid
+from sceneprior.core.contact_resolution import add_supports, body_boxes, is_stable, make_stable
+from sceneprior.core.scene import Mesh, Opening, Scene, SceneObject, Solid, Turned
+
+KINDS = ("box", "cylinder", "ellipsoid", "dome", "bowl")
+
+
+def standing(*objects, floor=None) -> tuple[Scene, dict[str, int]]:
+    scene, told = make_stable(Scene("room", "front3d_bedroom", objects, floor))
+    return scene, {key: value for key, value in told.items() if value}
+
+
+def deepest_overlap(scene: Scene) -> float:
+    """Box by box, as the definition."""
+    worst = 0.0
+    for row, item in enumerate(scene.objects):
+        for other in scene.objects[:row]:
+            for low, high in body_boxes(item):
+                for other_low, other_high in body_boxes(other):
+                    deep = np.minimum(high, other_high) - np.maximum(low, other_low)
+                    worst = max(worst, deep.min())
+    return worst
+
+
+def test_what_stands_apart_is_left_alone():
+    objects = (
+        solid_box("double_bed", (0, 0.3, 0), (1.8, 0.6, 2)),
+        solid_box("desk", (2, 0.4, 0), (1, 0.8, 1)),
+    )
+    scene, told = standing(*objects)
+    assert told == {}
+    np.testing.assert_array_equal(scene.centers_m, [item.center_m for item in objects])
+
+
+def test_floating_and_sunken_objects_are_set_down():
+    scene, told = standing(
+        solid_box("desk", (0, 0.45, 0), (1, 0.8, 1)),
+        solid_box("sofa", (3, 0.3, 0), (1, 0.8, 1)),
+        solid_box("pendant_lamp", (0, 2, 0), (0.4, 0.4, 0.4)),
+        solid_box("shelf", (3, 1.5, 2), (1, 0.3, 0.3)),  # at a wall
+        solid_box("stool", (-2, 2.5, 0), (0.4, 0.4, 0.4)),
+        solid_box("stool", (0, 1.05, 0), (0.8, 0.4, 0.2)),
+    )
+    assert told == {"set down": 4}
+    np.testing.assert_allclose(scene.centers_m[:, 1], [0.4, 0.4, 2, 1.5, 0.2, 1.0], atol=1e-9)
+
+
+def test_a_table_on_one_side_gets_feet_and_keeps_its_solids():
+    board = Solid("box", (-0.5, 0.7, -0.5), (0.5, 0.75, 0.5))
+    leg = Solid("cylinder", (-0.5, 0.0, -0.1), (-0.3, 0.7, 0.1))
+    table = SceneObject("table", (0.0, 0.375, 0.0), (1.0, 0.75, 1.0), solids=(board, leg))
+    table = replace(table, mesh=mesh_of(board))
+    assert not is_stable(table)
+    better = add_supports(table)
+    assert is_stable(better)
+    assert better.solids[:2] == (board, leg) and len(better.solids) == 6
+    lowest = {foot.low_m[1] for foot in better.solids[2:]}
+    assert lowest == {0.0}
+    assert len(better.mesh.faces) == len(table.mesh.faces) + 4 * 12
+    assert add_supports(better) is better
+
+
+def test_overlapping_objects_go_apart_and_the_larger_one_stays():
+    bed = solid_box("double_bed", (0, 0.3, 0), (1.8, 0.6, 2))
+    stand_ = solid_box("nightstand", (1.0, 0.25, 0.8), (0.5, 0.5, 0.4))
+    scene, told = standing(stand_, bed)
+    assert told == {"moved": 1}
+    assert scene.objects[1].center_m == bed.center_m
+    assert scene.objects[0].center_m == pytest.approx((1.152, 0.25, 0.8))
+    assert deepest_overlap(scene) == 0
+
+
+def test_a_chair_may_stand_under_a_table():
+    top = Solid("box", (-0.8, 0.7, -0.5), (0.8, 0.75, 0.5))
+    legs = [
+        Solid("box", (x - 0.05, 0.0, z - 0.05), (x + 0.05, 0.7, z + 0.05))
+        for x in (-0.7, 0.7)
+        for z in (-0.4, 0.4)
+    ]
+    table = SceneObject("table", (0.0, 0.375, 0.0), (1.6, 0.75, 1.0), solids=(top, *legs))
+    stool = solid_box("stool", (0, 0.2, 0.1), (0.4, 0.4, 0.4))
+    assert standing(table, stool)[1] == {}
+
+
+def test_pushed_objects_stay_on_the_floor():
+    """Without walls the desk would go to +x; there the floor ends, so it goes elsewhere."""
+    floor = np.array([[-1.0, -2.0], [1.3, -2.0], [1.3, 2.0], [-1.0, 2.0]])
+    bed = solid_box("double_bed", (0, 0.3, 0), (1.8, 0.6, 2))
+    desk = solid_box("desk", (0.9, 0.4, -1.2), (0.8, 0.8, 0.6))
+    scene, _ = standing(bed, desk, floor=floor)
+    low, high = body_boxes(scene.objects[1])[0]
+    assert high[0] <= 1.3 + 1e-9 and low[2] >= -2 and deepest_overlap(scene) == 0
+
+
+def test_pushed_objects_leave_doors_free():
+    """The nightstand would go to +x, where a door swings; without the door it does."""
+    floor = np.array([[-1.0, -2.0], [2.0, -2.0], [2.0, 2.0], [-1.0, 2.0]])
+    door = Opening("door", (2.0, 0.4), (2.0, 1.1), 0.0, 2.0)
+    bed = solid_box("double_bed", (0, 0.3, 0), (1.8, 0.6, 2))
+    nightstand = solid_box("nightstand", (1.0, 0.25, 0.8), (0.5, 0.5, 0.4))
+    for openings, free in (((), False), ((door,), True)):
+        scene = Scene("room", "front3d_bedroom", (bed, nightstand), floor, openings=openings)
+        moved, told = make_stable(scene)
+        low, high = body_boxes(moved.objects[1])[0]
+        swing = shapely.box(1.3, 0.4, 2.0, 1.1)
+        shared = swing.intersection(shapely.box(*low[::2], *high[::2])).area
+        assert told["moved"] == 1 and (shared < 1e-3) == free
+    assert deepest_overlap(moved) == 0
+
+
+def test_without_a_free_place_an_object_is_left_out():
+    wall_to_wall = solid_box("double_bed", (0, 0.5, 0), (9, 1, 9))
+    scene, told = standing(wall_to_wall, solid_box("chair", (0, 0.5, 0), (1, 1, 1)))
+    assert told == {"left out": 1} and len(scene.objects) == 1
+
+
+def test_turned_boxes_are_bodies_at_their_angle():
+    """A narrow box at 45 degrees: another one may stand in the corner of its bounding box."""
+    turned = Turned(np.pi / 4, (1.4, 1.0, 0.2))
+    side = (1.4 + 0.2) / np.sqrt(2)
+    screen = SceneObject("shelf", (0.0, 0.5, 0.0), (side, 1.0, side), turned=turned)
+    (body,) = colliders(screen)
+    assert volume_and_centroid(body)[0] == pytest.approx(1.4 * 1.0 * 0.2)
+    corner = solid_box("stool", (0.4, 0.2, 0.4), (0.3, 0.4, 0.3))
+    assert standing(screen, corner)[1] == {}
+    assert standing(screen, solid_box("stool", (0.4, 0.2, -0.4), (0.3, 0.4, 0.3)))[1] == {
+        "moved": 1
+    }
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_volumes_and_centroids_are_those_of_meshes(kind):
+    solid = Solid(kind, (1.0, 2.0, 3.0), (1.5, 3.0, 3.8))
+    volume, center = volume_and_centroid(solid)
+    mesh = trimesh.Trimesh(*(np.asarray(part) for part in vars(mesh_of(solid)).values()))
+    assert mesh.is_volume
+    # A circle of 16 corners has 0.974 of the area.
+    assert mesh.volume == pytest.approx(volume, rel=0.07 if kind != "box" else 1e-9)
+    np.testing.assert_allclose(mesh.center_mass, center, atol=0.02)
+    found = volume_and_centroid(mesh_of(solid))
+    assert found[0] == pytest.approx(mesh.volume)
+    np.testing.assert_allclose(found[1], mesh.center_mass)
+
+
+def test_coacd_cuts_a_mesh_into_convex_parts():
+    pytest.importorskip("coacd", reason="no coacd here: pip install -e '.[sim]'")
+    blocks = [
+        trimesh.creation.box(bounds=bounds)
+        for bounds in ([[0, 0, 0], [1, 0.2, 1]], [[0, 0, 0], [0.2, 1, 1]])
+    ]
+    corner = trimesh.boolean.union(blocks)
+    parts = convex_parts(Mesh(corner.vertices, corner.faces))
+    assert len(parts) == 2
+    total = sum(volume_and_centroid(part)[0] for part in parts)
+    assert total == pytest.approx(corner.volume, rel=0.02)
+
+
+def test_closed_components_are_bodies_of_their_own(monkeypatch):
+    """A table of five boxes that meet, without CoACD."""
+    monkeypatch.setattr("sceneprior.core.colliders._coacd", lambda: None)
+    boxes = [trimesh.creation.box((1.2, 0.04, 0.8), transform=at(0, 0.7, 0))]
+    boxes += [
+        trimesh.creation.box((0.06, 0.7, 0.06), transform=at(x, 0.35, z))
+        for x in (-0.5, 0.5)
+        for z in (-0.3, 0.3)
+    ]
+    table = trimesh.util.concatenate(boxes)
+    parts = convex_parts(Mesh(table.vertices, table.faces))
+    volumes = sorted(volume_and_centroid(part)[0] for part in parts)
+    assert volumes == pytest.approx(sorted(box.volume for box in boxes))
+    # An open mesh and a cavity have no components of their own: one hull.
+    for faces in (table.faces[1:], np.vstack([table.faces[:12], table.faces[12:, ::-1]])):
+        (hull,) = convex_parts(Mesh(table.vertices, faces))
+        assert volume_and_centroid(hull)[0] > 0.5
+
+
+def at(x: float, y: float, z: float) -> np.ndarray:
+    return trimesh.transformations.translation_matrix([x, y, z])
+
+
+def test_without_coacd_a_mesh_is_its_convex_hull(monkeypatch):
+    monkeypatch.setattr("sceneprior.core.colliders._coacd", lambda: None)
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    dented = Mesh(np.vstack([ball.vertices, [[0, 0.1, 0]]]), ball.faces)
+    (hull,) = convex_parts(dented)
+    assert volume_and_centroid(hull)[0] == pytest.approx(ball.volume)

@@ -1,0 +1,117 @@
+"""Blends of parts: the ends themselves, in any order and direction, without jumps, closed."""
+
+from itertools import permutations
+
+import numpy as np
+import pytest
+import trimesh
+from parts_of_rooms import CORNER, TABLE, boxes
+
+from sceneprior.core.part_blends import blend_parts, matched_outlines, matched_parts
+from sceneprior.core.parts import BOX, CYLINDER, DOME, SQUARE, Parts, filled_cells, surface_of_parts
+
+ROUND = Parts(
+    np.array([CYLINDER, CYLINDER, DOME]), np.zeros(3, np.int64),
+    np.array([
+        [[-0.5, 0.5], [0.375, 0.5], [-0.5, 0.5]],
+        [[-0.125, 0.125], [-0.375, 0.375], [-0.125, 0.125]],
+        [[-0.375, 0.375], [-0.5, -0.375], [-0.375, 0.375]],
+    ]),
+)  # fmt: skip
+SOFA = CORNER._replace(
+    outline=np.array([[-0.5, -0.5], [0.2, -0.5], [0.5, -0.1], [0.5, 0.5], [-0.3, 0.5], [-0.5, 0.3]])
+)
+SHAPES = {"table": TABLE, "corner": CORNER, "round": ROUND, "sofa": SOFA}
+PAIRS = [("table", "corner"), ("corner", "sofa"), ("round", "table"), ("round", "sofa")]
+
+
+def volume(parts: Parts) -> float:
+    mesh = trimesh.Trimesh(*surface_of_parts(parts))
+    assert mesh.is_watertight and mesh.is_winding_consistent
+    assert np.abs(parts.ends).max() == np.abs(parts.ends.min(axis=0)[:, 0]).min() == 0.5
+    assert parts.ends.max(axis=0)[:, 1].min() == 0.5, "they fill their box on all sides"
+    return float(mesh.volume)
+
+
+@pytest.mark.parametrize(("first", "second"), PAIRS)
+def test_shares_of_0_and_1_are_the_ends(first, second):
+    a, b = SHAPES[first], SHAPES[second]
+    matched = matched_parts(a, b)
+    for share, end, same in ((0.0, a, matched[0]), (1.0, b, matched[1])):
+        assert blend_parts(*matched, share) is same
+        # Hidden solids and added corners change nothing.
+        np.testing.assert_array_equal(filled_cells(same, 30, 1.1), filled_cells(end, 30, 1.1))
+        assert volume(same) == pytest.approx(volume(end), abs=2e-3)  # every solid grows by 5e-4
+
+
+@pytest.mark.parametrize(("first", "second"), PAIRS)
+def test_volumes_change_without_jumps_and_meshes_stay_closed(first, second):
+    matched = matched_parts(SHAPES[first], SHAPES[second])
+    volumes = [volume(blend_parts(*matched, share)) for share in np.linspace(0, 1, 41).tolist()]
+    # All shapes lie in a box of volume 1, and no side moves by more than 1 / 40 of it.
+    assert np.abs(np.diff(volumes)).max() < 0.1 and min(volumes) > 0.01
+    near = [volume(blend_parts(*matched, share)) for share in (0.0, 1e-5, 1 - 1e-5, 1.0)]
+    assert np.abs(np.diff(near)[[0, 2]]).max() < 2e-3  # sides move in steps of a thousandth
+
+
+@pytest.mark.parametrize(("first", "second"), PAIRS)
+def test_the_way_back_is_the_way_there(first, second):
+    there = matched_parts(SHAPES[first], SHAPES[second])
+    back = matched_parts(SHAPES[second], SHAPES[first])
+    for one, other in zip(there, back[::-1], strict=True):
+        for here, same in zip(one, other, strict=True):
+            np.testing.assert_array_equal(here, same)
+
+
+def test_the_order_of_parts_makes_no_difference():
+    once = [np.array(part) for part in matched_parts(CORNER, ROUND)[0][:3]]
+    for order in permutations(range(3)):
+        rows = list(order)
+        shuffled = Parts(*(part[rows] for part in CORNER[:3]))
+        again = matched_parts(shuffled, ROUND)[0]
+        for here, same in zip(again[:3], once, strict=True):
+            np.testing.assert_array_equal(here, same)
+
+
+def test_solids_of_one_kind_become_the_nearest_of_the_other():
+    """The assignment against all assignments of four legs to four others, turned and shifted."""
+    rng = np.random.default_rng(0)
+    low, other = rng.uniform(-0.5, 0.3, (2, 4, 3))
+    a, b = (
+        Parts(np.full(4, BOX), np.zeros(4, np.int64), np.stack([each, each + 0.15], axis=2))
+        for each in (low, other)
+    )
+    here, there = matched_parts(a, b)
+    found = ((here.ends - there.ends) ** 2).sum()
+    slow = min(((low[list(order)] - other) ** 2).sum() * 2 for order in permutations(range(4)))
+    assert found == pytest.approx(slow, abs=1e-5)
+
+
+def test_what_has_no_partner_is_squeezed_into_a_box_or_into_its_centre():
+    whole = boxes((0, 64, 0, 48, 0, 64))
+    here, there = matched_parts(TABLE, whole)
+    assert len(here.kind) == len(there.kind) == 5
+    inside = (there.ends >= whole.ends[..., :1]) & (there.ends <= whole.ends[..., 1:])
+    assert inside.all(), "legs are hidden in the other shape"
+    bare = Parts(*(part[:1] for part in ROUND[:3]))
+    hidden = matched_parts(whole, bare)[1].ends[matched_parts(whole, bare)[1].kind == BOX]
+    np.testing.assert_array_equal(hidden[..., 0], hidden[..., 1])
+
+
+def test_corners_of_outlines_correspond_and_outlines_keep_their_area():
+    a, b = matched_outlines(SQUARE, SOFA.outline)
+    assert len(a) == len(b) >= 6
+    for matched, outline in ((a, SQUARE), (b, SOFA.outline)):
+        assert area(matched) == pytest.approx(area(outline), abs=1e-5)
+        apart = np.linalg.norm(matched[:, None] - outline, axis=2).min(axis=0)
+        assert apart.max() < 1e-5, "every corner is kept"
+    # The uncut corners of both are one point all the way.
+    kept = np.linalg.norm(a - b, axis=1) < 1e-6
+    for corner in ([-0.5, -0.5], [0.5, 0.5]):
+        assert (np.linalg.norm(a[kept] - corner, axis=1) < 1e-6).any()
+    assert matched_outlines(SQUARE, SQUARE)[0] is SQUARE
+
+
+def area(outline: np.ndarray) -> float:
+    x, z = outline.T
+    return float((x * np.roll(z, -1) - z * np.roll(x, -1)).sum() / 2)
