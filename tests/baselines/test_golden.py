@@ -69,13 +69,13 @@ def test_the_first_losses_and_results_are_the_frozen_ones(
             )
             scenes = prior.decode(points)
         results = {
-            name: getattr(scenes, name).square().mean()
-            for name in (
-                "class_logits",
-                "centers_m",
-                "sizes_m",
-                "completeness_logits",
-                "vertices_m",
+            name: part.square().mean()
+            for name, part in (
+                ("classes", scenes.class_logits.softmax(dim=-1)),
+                ("centers", scenes.centers_m),
+                ("sizes", scenes.sizes_m),
+                ("completeness", scenes.completeness_logits),
+                ("meshes", scenes.vertices_m),
             )
         }
     elif hasattr(prior, "sample"):
