@@ -35,10 +35,10 @@ from sceneprior.apps.config import load_run
 from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.overlaps import match_scenes
 from sceneprior.core.scene import Scene
+from sceneprior.evaluation.metric import object_count
 from sceneprior.evaluation.metrics.contents import (
     category_kl,
     class_frequencies,
-    object_counts,
     type_share,
 )
 from sceneprior.evaluation.metrics.overlaps import room_overlaps
@@ -135,7 +135,7 @@ def evaluate(
         "category_kl": round(category_kl(class_frequencies(tests), class_frequencies(every)), 3),
         "overlaps": round(float(np.mean([room_overlaps(s).intersect.sum() for s in every])), 2),
         "beds": round(type_share(every) or 0.0, 3),
-        "objects": round(float(object_counts(every).mean()), 2),
+        "objects": round(float(np.mean([object_count(room) for room in every])), 2),
         "found": round(sum(extra["replaced"] for extra in marked) / asked, 2) if marked else "-",
         "off_m": round(float(np.mean(off)), 2) if off else "-",
         "differ": round(float(np.mean(apart)), 2) if apart else "-",

@@ -15,7 +15,7 @@ from PIL import Image
 from sceneprior.apps.config import load_any_run
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.ground_truth import reference_scenes
-from sceneprior.evaluation.layout_distance import nearest_room
+from sceneprior.evaluation.metrics.novelty import nearest_room
 from sceneprior.render.pictures import contact_sheet
 from sceneprior.render.topdown import corner_view, perspective
 

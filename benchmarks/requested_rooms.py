@@ -36,7 +36,7 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.shards import iterate_rooms
-from sceneprior.evaluation.metrics.layout_classifier import METRICS
+from sceneprior.evaluation.metrics.layout_classifier import layout_classifier_accuracy
 from sceneprior.lifted.requests.relation_checks import Furniture, RelationChecks
 from sceneprior.lifted.requests.relations import OUTWARD, TO_ROOM, TO_TARGET
 from sceneprior.lifted.requests.shape import RoomShape
@@ -177,8 +177,7 @@ def accuracy(
         SimpleNamespace(scenes=scenes, counts=np.ones((1, len(scenes)), dtype=int))
         for scenes in (rooms, test)
     )
-    (metric,) = METRICS
-    found = metric.function(own, SimpleNamespace(test=others, real=real, seed=seed))
+    found = layout_classifier_accuracy(own, SimpleNamespace(test=others, real=real, seed=seed))
     return round(float(found.value), 3)
 
 

@@ -22,7 +22,7 @@ from sceneprior.apps.config import load_config
 from sceneprior.core.dataset import FlatViews, ViewDataset
 from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.views import SceneViews
-from sceneprior.evaluation.metrics.decoded_rooms import reconstruction_scores
+from sceneprior.evaluation.metrics.contents import reconstruction_scores
 from sceneprior.paper.config import PaperConfig
 from sceneprior.paper.decode import decode_training_rooms
 from sceneprior.paper.prior import TrainedPrior

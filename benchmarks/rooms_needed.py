@@ -34,7 +34,7 @@ import sceneprior
 from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.scene import Scene
 from sceneprior.core.shards import iterate_rooms
-from sceneprior.evaluation.metrics.relations import METRICS
+from sceneprior.evaluation.metrics.relations import relation_distance
 from sceneprior.paper.decode import decode_training_rooms
 
 TRAIN_SHARE = 0.7
@@ -147,7 +147,7 @@ def relations(rooms: Sequence[Scene], real: Sequence[Scene], test: Sequence[Scen
         SimpleNamespace(scenes=scenes, counts=np.ones((1, len(scenes)), dtype=int))
         for scenes in (rooms, test)
     )
-    found = METRICS[0].function(own, SimpleNamespace(test=others, real=real))
+    found = relation_distance(own, SimpleNamespace(test=others, real=real))
     return float(found.value)
 
 

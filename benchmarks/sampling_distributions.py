@@ -19,7 +19,7 @@ from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.scene import Scene
 from sceneprior.evaluation.features import Drawing
-from sceneprior.evaluation.metrics.frechet import frechet_distance
+from sceneprior.evaluation.metrics.picture_distances import frechet_distance
 from sceneprior.evaluation.room_sets import without_void
 
 DISTRIBUTIONS = ("kernel", "paper")

@@ -29,10 +29,10 @@ from sceneprior.core.meshes import icosphere
 from sceneprior.core.overlaps import match_scenes
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.core.surfaces import chamfer_of, nearest_distances, surface_of
-from sceneprior.evaluation.metrics.decoded_rooms import reconstruction_scores
-from sceneprior.evaluation.metrics.frechet import FRECHET
-from sceneprior.evaluation.metrics.mesh_metrics import f_score, sample_surface
+from sceneprior.evaluation.metrics.contents import reconstruction_scores
+from sceneprior.evaluation.metrics.picture_distances import FRECHET
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
+from sceneprior.evaluation.view_scores import f_score, sample_surface
 from sceneprior.paper.prior import TrainedPrior
 from sceneprior.render.appearance import box_mesh
 from sceneprior.render.pictures import contact_sheet

@@ -21,7 +21,7 @@ from sceneprior.apps.config import load_config, load_run
 from sceneprior.apps.experiments.evaluate import decoded_and_true
 from sceneprior.core.cameras import boxes_of_points
 from sceneprior.core.dataset import ViewDataset
-from sceneprior.evaluation.metrics.decoded_rooms import reconstruction_scores
+from sceneprior.evaluation.metrics.contents import reconstruction_scores
 from sceneprior.paper.matching import match_objects
 from sceneprior.paper.prior import TrainedPrior
 from sceneprior.render.silhouettes import render_scene

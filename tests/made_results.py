@@ -7,7 +7,7 @@ import yaml
 from tiny_runs import tiny_baseline_settings, tiny_lifted_settings, write_tiny_config
 
 from sceneprior.core.files import write_json
-from sceneprior.evaluation.registry import DECODED, METRICS
+from sceneprior.evaluation.metrics import DECODED, METRICS
 
 SAMPLER = {"epochs": 3, "width": 16, "layers": 1, "heads": 2, "val_every": 1}
 KEYS = [metric.key for metric in (*METRICS, *DECODED) if metric.column]

@@ -8,10 +8,9 @@ import torch
 
 from sceneprior.core.classes import label_set
 from sceneprior.core.scene import Scene, SceneObject
-from sceneprior.evaluation.bootstrap import resample_counts
-from sceneprior.evaluation.layout_distance import nearest_known
-from sceneprior.evaluation.metric import Comparison, RoomSet
-from sceneprior.evaluation.metrics import classifier, layout_classifier
+from sceneprior.evaluation.metric import Comparison, RoomSet, resample_counts
+from sceneprior.evaluation.metrics import layout_classifier, picture_classifiers
+from sceneprior.evaluation.metrics.novelty import nearest_known
 
 UNIT = (1.0, 1.0, 1.0)
 
@@ -62,7 +61,7 @@ def without_classifiers(patch: pytest.MonkeyPatch) -> None:
     def answer_one(features, labels, others, seed):
         return np.ones(len(others), dtype=int)
 
-    patch.setattr(classifier, "linear", answer_one)
+    patch.setattr(picture_classifiers, "linear", answer_one)
     patch.setattr(layout_classifier, "boosted_trees", answer_one)
 
 

@@ -1,18 +1,112 @@
-"""The `Metric` record, and the sets of rooms that metrics compare."""
+"""The `Metric` record, the sets of rooms that metrics compare, and their estimates with bootstrap
+intervals."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int, Real, Shaped
 
+from sceneprior.core.classes import VOID
 from sceneprior.core.scene import Scene
-from sceneprior.evaluation.bootstrap import Estimate, mean_of_rooms
 from sceneprior.evaluation.features import Features
-from sceneprior.evaluation.layout_distance import Nearest
 
+RESAMPLES = 200
+COVERAGE = 0.95
+METHOD = (
+    f"{COVERAGE:.0%} bootstrap over rooms, both sets resampled with replacement; quantiles shifted "
+    "so that the mean of the resamples equals the metric's value"
+)
+
+
+def resample_counts(
+    rooms: int, resamples: int, seed: int | tuple[int, ...]
+) -> Int[np.ndarray, "resamples rooms"]:
+    """Count how often each room occurs in each resample of `rooms` drawn with replacement."""
+    shares = np.full(rooms, 1 / rooms)
+    return np.random.default_rng(seed).multinomial(rooms, shares, size=resamples)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A metric's value on the rooms and on every resample of them."""
+
+    value: float | None
+    """Value on the rooms themselves; None if the metric is undefined for this set."""
+    resamples: Float[np.ndarray, " resamples"]
+    """Values on the resamples; those on which the metric is undefined are left out."""
+    low: float = -np.inf
+    high: float = np.inf
+    """Bounds of the metric by definition; the interval is clipped to [low, high]."""
+
+    def interval(self) -> list[float] | None:
+        """Lower and upper end of the interval; None if there is no value or there are no resamples.
+
+        Drawing with replacement repeats rooms, and sets with fewer distinct rooms lie farther
+        apart: the resamples of a Frechet distance all lie above the distance itself. This bias is
+        removed: the quantiles are shifted so that the mean of the resamples equals the value.
+        """
+        if self.value is None or len(self.resamples) == 0:
+            return None
+        tail = (1 - COVERAGE) / 2
+        spread = np.quantile(self.resamples, [tail, 1 - tail])
+        ends = self.value + spread - self.resamples.mean()
+        return [float(end) for end in np.clip(ends, self.low, self.high)]
+
+    def combined(
+        self,
+        other: "Estimate",
+        function: Callable[[Any, Any], Any],
+        low: float = -np.inf,
+        high: float = np.inf,
+    ) -> "Estimate":
+        """A function of this metric and another, on the rooms and on each resample that both have;
+        undefined if either metric is, and left out where the function is not finite."""
+        if self.value is None or other.value is None:
+            return Estimate(None, np.zeros(0))
+        both = min(len(self.resamples), len(other.resamples))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            value = function(np.float64(self.value), np.float64(other.value))
+            resamples = function(self.resamples[:both], other.resamples[:both])
+        if not np.isfinite(value):
+            return Estimate(None, np.zeros(0))
+        return Estimate(float(value), resamples[np.isfinite(resamples)], low, high)
+
+
+def ratio(
+    numerators: Real[np.ndarray, " rooms"],
+    denominators: Real[np.ndarray, " rooms"],
+    counts: Int[np.ndarray, "resamples rooms"],
+    high: float = np.inf,
+) -> Estimate:
+    """The ratio of two sums over rooms, from 0 to `high`, such as a mean over rooms or objects.
+
+    A denominator of 0 leaves its room out. If all are 0, the value is None.
+    """
+    total = denominators.sum()
+    value = float(numerators.sum() / total) if total > 0 else None
+    over = counts @ denominators
+    return Estimate(value, (counts @ numerators)[over > 0] / over[over > 0], 0.0, high)
+
+
+def mean_of_rooms(
+    values: Sequence[float | int | None] | Shaped[np.ndarray, " rooms"],
+    counts: Int[np.ndarray, "resamples rooms"],
+    high: float = np.inf,
+) -> Estimate:
+    """The mean over rooms of non-negative values; rooms with None are left out."""
+    known = np.array([value is not None for value in values], dtype=float)
+    return ratio(np.array([value or 0.0 for value in values], dtype=float), known, counts, high)
+
+
+def mean_of_shares(a: Estimate, b: Estimate) -> Estimate:
+    """The mean of two shares, from 0 to 1; undefined if either share is undefined."""
+    return a.combined(b, lambda one, other: (one + other) / 2, 0.0, 1.0)
+
+
+Function = TypeVar("Function", bound=Callable[..., Any])
 Direction = Literal["closer", "lower", "higher", "half", "none"]
 """The better direction; `closer` marks a distance to the test rooms, where lower is better."""
 ARROWS = {"closer": " ↓", "lower": " ↓", "higher": " ↑", "half": " → 0.5", "none": ""}
@@ -28,9 +122,28 @@ EACH_SET = ("test", *AGAINST_TEST)
 GENERATED = ("generated",)
 USED = ("test", "shuffled", "independent", "generated")
 """Sets for which metrics of use (see use.py) are computed."""
+MATCHED: tuple[str, ...] = ()
+"""No set: the metric compares decoded training rooms with their ground truth."""
 Counts = Mapping[str, tuple[float | int, float | int]]
 """Numerator and denominator of each metric of use for one room, by key. The metric of a set is the
 ratio of their sums over rooms; a room with denominator 0 is left out."""
+
+
+class Nearest(NamedTuple):
+    """Layout distances of rooms to training rooms, true and decoded, in metres."""
+
+    training_m: Float[np.ndarray, " rooms"]
+    """Distance to the nearest true training room."""
+    decoded_m: Float[np.ndarray, " rooms"] | None
+    """Distance to the nearest training room as the prior decodes it; None if it decodes none."""
+    as_copies_m: Float[np.ndarray, " rooms"]
+    """Distance to the nearest true or decoded room by `nearest_distances(as_copies=True)`; inf if
+    none of these rooms holds the same furniture."""
+
+    def of(self, rows: Sequence[int]) -> "Nearest":
+        """The distances of the rooms `rows`."""
+        picked = [None if part is None else part[list(rows)] for part in self]
+        return Nearest(*picked)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -54,6 +167,26 @@ class RoomSet:
         pictures = self.box_pictures if boxes else self.pictures
         assert pictures is not None  # metrics of boxes are computed only with `--boxes`
         return pictures[network]
+
+
+def object_count(scene: Scene) -> int:
+    """Number of objects in a scene, void left out."""
+    return int((scene.class_indices != VOID).sum())
+
+
+def emptiness(scenes: Sequence[Scene]) -> str | None:
+    """A warning if more than half of the generated rooms are empty; else None.
+
+    Metrics of empty rooms mislead: no objects intersect, and a blank picture easily lies in the
+    ball around a real room's picture, which raises precision.
+    """
+    empty = sum(object_count(scene) == 0 for scene in scenes)
+    if 2 * empty <= len(scenes):
+        return None
+    return (
+        f"{empty} of {len(scenes)} generated rooms are empty, so none of the other scores can be "
+        "trusted: train longer."
+    )
 
 
 def mean_over_rooms(
@@ -110,15 +243,17 @@ class Metric:
     direction: Direction
     function: Callable[..., Any]
     """Computes an `Estimate` from a `RoomSet` and a `Comparison`; None if it needs decoded training
-    rooms and there are none, and the result then leaves the metric out. (The metrics of
-    metrics/decoded_rooms.py compute a number from a list of `SceneMatch` instead, and metrics of
-    use, `USE` of the registry, compute the `Counts` of a scene.)"""
+    rooms and there are none, and the result then leaves the metric out. A metric of `USED` rooms
+    computes the `Counts` of a scene, and one of `MATCHED` rooms a number from a list of
+    `SceneMatch`."""
     sets: tuple[str, ...] = EACH_SET
     """Sets of rooms for which the metric is computed; the value of test rooms is `<key>_test`."""
     network: str | None = None
     """The network that reads the pictures (`inception`, `alexnet`, `effnet_lite0`), if any."""
     boxes: bool = False
     """True for metrics of pictures in which every object is drawn as its box (`--boxes`)."""
+    needs: str = "a floor (floor_m) in the scenes"
+    """What a metric of use needs beside objects."""
     protocol: Mapping[str, Any] = field(default_factory=dict)
     """Entries of the metric in the protocol of a result file."""
     column: TableColumn | None = None
@@ -134,3 +269,26 @@ class Metric:
         if self.network is not None and self.network not in networks:
             return f"--{self.network}"
         return None if boxes or not self.boxes else "--boxes"
+
+
+DEFINED: list[Metric] = []
+"""All metrics, in the order of their definitions; metrics/__init__.py sorts them."""
+
+
+def metric(
+    key: str, title: str, unit: str, direction: Direction, *rest: Any, **more: Any
+) -> Callable[[Function], Function]:
+    """Define the decorated function as the metric `key`; `Metric` describes the arguments.
+
+    A function that computes several metrics, such as the `Counts` of a scene, is decorated once
+    for each.
+    """
+
+    def define(function: Function) -> Function:
+        # Decorators run from the last to the first; tables show the first above the last.
+        known = (row for row, other in enumerate(DEFINED) if other.function is function)
+        made = Metric(key, title, unit, direction, function, *rest, **more)
+        DEFINED.insert(next(known, len(DEFINED)), made)
+        return function
+
+    return define

@@ -1,9 +1,13 @@
-"""Self-contained HTML pages: templates, and interactive 3D models that need no network."""
+"""Self-contained HTML pages that need no network: templates, pictures and 3D models of rooms, and
+the page of rooms to send to others."""
 
 import base64
+import io
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,12 +16,22 @@ from markupsafe import Markup
 from PIL import Image
 
 from sceneprior import __version__
+from sceneprior.core.classes import label_set
+from sceneprior.core.files import write_whole
 from sceneprior.core.scene import Mesh, Scene
 from sceneprior.core.shell import ShellName, shell_of
 from sceneprior.core.surfaces import decimate
+from sceneprior.render.appearance import quiet_colors
+from sceneprior.render.floor_plans import plan_of
 from sceneprior.render.pictures import png_bytes
 from sceneprior.render.scene_files import scene_to_glb
-from sceneprior.render.topdown import corner_view, shows_walls
+from sceneprior.render.topdown import (
+    corner_view,
+    perspective,
+    shows_walls,
+    topdown_protocol,
+    view_of,
+)
 
 FACES_PER_PAGE = 100_000
 """Limit on the faces of all models of a page. A face takes 24 bytes, so a page has a few MB."""
@@ -74,3 +88,82 @@ def png_uri(image: Image.Image) -> str:
 def data_uri(kind: str, content: bytes) -> str:
     """A data URI: a file's content inside a page, with its media type."""
     return f"data:{kind};base64,{base64.b64encode(content).decode()}"
+
+
+_POINTS_PER_CURVE = 400
+_EMPTY = (244, 245, 247)
+
+
+@dataclass(frozen=True)
+class RoomPictures:
+    """The pictures and the 3D model of one scene on the page."""
+
+    name: str
+    contents: str
+    """The scene's objects in words: "double bed, nightstand ×2"."""
+    topdown: str
+    """Data URI of the plan from straight above, at half size and the same scale for all rooms."""
+    perspective: str
+    """Data URI of the shaded view from above a corner."""
+    glb: str
+    """Data URI of the 3D model that replaces the shaded view; empty if none was requested."""
+
+
+def room_pictures(scene: Scene, most_faces: int = 0, shell: ShellName = "none") -> RoomPictures:
+    """Draw a scene's plan and corner view, and export its 3D model.
+
+    View and model have walls if `shell` is `walls`, or the room has doors or windows. `most_faces`
+    limits the faces of each object's mesh; 0 leaves the model out.
+    """
+    counts = Counter(item.label.replace("_", " ") for item in scene.objects)
+    words = [name if many == 1 else f"{name} ×{many}" for name, many in sorted(counts.items())]
+    flat = plan_of(scene, np.zeros(2), topdown_protocol(scene.label_set).window_m)
+    flat = flat.resize((256, 256), Image.Resampling.BOX)
+    solid = io.BytesIO()
+    shaded = Image.fromarray(perspective(scene, view=view_of(scene, (330, 440), shell)))
+    shaded.save(solid, format="JPEG", quality=86, optimize=True)
+    solid_uri = data_uri("image/jpeg", solid.getvalue())
+    glb = data_uri("model/gltf-binary", glb_of(scene, most_faces, shell)) if most_faces else ""
+    contents = ", ".join(words) or "nothing"
+    return RoomPictures(scene.name, contents, png_uri(flat.quantize(64)), solid_uri, glb)
+
+
+def legend(scenes: Sequence[Scene]) -> list[tuple[str, str]]:
+    """(class name, CSS colour) of every class in the scenes, in the label set's order."""
+    if not scenes:
+        return []
+    names = label_set(scenes[0].label_set)
+    colors = quiet_colors(names)
+    present = {item.label for scene in scenes for item in scene.objects}
+    return [
+        (name.replace("_", " "), f"#{bytes(color.tolist()).hex()}")
+        for name, color in zip(names, colors, strict=True)
+        if name in present
+    ]
+
+
+ROOMS_SHOWN = 24
+
+
+def write_rooms_page(
+    path: Path,
+    scenes: Sequence[Scene],
+    *,
+    title: str,
+    subtitle: str,
+    pictures: Sequence[tuple[str, str]] = (),
+    shell: ShellName = "none",
+) -> None:
+    """Write one self-contained HTML file of a few MB, with `pictures` (caption, data URI) above the
+    first rooms. `shell` is that of `room_pictures`."""
+    shown = scenes[:ROOMS_SHOWN]
+    most_faces = faces_per_object(shown)
+    page = render(
+        "rooms.html.jinja",
+        title=title,
+        subtitle=subtitle,
+        pictures=pictures,
+        rooms=[room_pictures(scene, most_faces, shell) for scene in shown],
+        legend=legend(shown),
+    )
+    write_whole(path, page)

@@ -19,11 +19,10 @@ from sceneprior.core.ground_truth import (
     stream_scenes,
 )
 from sceneprior.core.scene import Scene
-from sceneprior.evaluation.bootstrap import resample_counts
 from sceneprior.evaluation.features import Drawing, Features
-from sceneprior.evaluation.layout_distance import nearest_known
-from sceneprior.evaluation.metric import RoomSet
+from sceneprior.evaluation.metric import RoomSet, resample_counts
 from sceneprior.evaluation.metrics.contents import common_label_set
+from sceneprior.evaluation.metrics.novelty import nearest_known
 
 
 @dataclass(frozen=True)

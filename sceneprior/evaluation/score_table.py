@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from sceneprior.evaluation.registry import METRICS, USE
+from sceneprior.evaluation.metrics import METRICS, USE
 
 WIDTH = 150
 """Width in characters of a table written to a file; narrower tables fold intervals."""

@@ -9,17 +9,23 @@ from typing import Any
 
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene
-from sceneprior.evaluation.alexnet import check_alexnet
-from sceneprior.evaluation.bootstrap import METHOD, RESAMPLES, Estimate
-from sceneprior.evaluation.features import Drawing
-from sceneprior.evaluation.metric import PICTURED, Comparison, RoomSet
-from sceneprior.evaluation.metrics.contents import common_label_set, emptiness
+from sceneprior.evaluation.features import Drawing, check_inception, file_digest
+from sceneprior.evaluation.metric import (
+    METHOD,
+    PICTURED,
+    RESAMPLES,
+    Comparison,
+    Estimate,
+    RoomSet,
+    emptiness,
+)
+from sceneprior.evaluation.metrics import METRICS
+from sceneprior.evaluation.metrics.contents import TYPE_CLASSES, common_label_set
 from sceneprior.evaluation.metrics.layout_classifier import FEW_TEST_ROOMS
 from sceneprior.evaluation.metrics.novelty import near_copy_threshold
 from sceneprior.evaluation.metrics.overlaps import plausible_pairs
+from sceneprior.evaluation.metrics.picture_classifiers import ALEXNET, check_alexnet
 from sceneprior.evaluation.metrics.relations import furthest_pairs
-from sceneprior.evaluation.networks import check_inception
-from sceneprior.evaluation.registry import METRICS, definitions
 from sceneprior.evaluation.room_sets import choose_rooms, draw_rooms, room_sets
 
 FORMAT = "sceneprior-scores"
@@ -128,7 +134,7 @@ def evaluate_synthesis(
             for group, features in drawn.items()
         },
         "networks": drawing.networks,
-        **definitions(names, options.alexnet),
+        **_definitions(names, options.alexnet),
         "left_out": _left_out(columns["generated"], options),
         "packages": _package_versions(),
     }
@@ -137,6 +143,18 @@ def evaluate_synthesis(
         "relations": furthest_pairs(sets["generated"], sets["train"], comparison),
         "note": " ".join([*filter(None, notes), NOTE]),
         "protocol": protocol,
+    }
+
+
+def _definitions(names: str, alexnet: Path | None) -> dict[str, Any]:
+    """The protocol entries of all metrics, whether or not they could be computed."""
+    stated: dict[str, Any] = {} if alexnet is None else {"sca": {**ALEXNET, **file_digest(alexnet)}}
+    for metric in METRICS:
+        stated |= metric.protocol
+    return stated | {
+        "independent": "objects of training rooms put together at random (independent_rooms), as "
+        "many rooms as real training rooms; drawn as boxes, _meshes: with the real meshes",
+        "type_share": list(TYPE_CLASSES.get(names, ())),
     }
 
 

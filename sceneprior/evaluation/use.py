@@ -15,11 +15,10 @@ from sceneprior.core.contact_resolution import make_stable
 from sceneprior.core.errors import InputError
 from sceneprior.core.ground_truth import independent_rooms, reference_scenes, shuffled_rooms
 from sceneprior.core.scene import Scene
-from sceneprior.evaluation.bootstrap import METHOD, Estimate, ratio, resample_counts
-from sceneprior.evaluation.metric import Counts
-from sceneprior.evaluation.metrics import clearance, stability
+from sceneprior.evaluation.metric import METHOD, Counts, Estimate, Metric, ratio, resample_counts
+from sceneprior.evaluation.metrics import USE
 from sceneprior.evaluation.metrics.contents import common_label_set
-from sceneprior.evaluation.registry import USE, use_definitions
+from sceneprior.evaluation.metrics.stability import stable_count
 from sceneprior.evaluation.room_sets import without_void
 from sceneprior.evaluation.synthesis import FORMAT, VERSION, EvalOptions, result_of
 
@@ -76,10 +75,10 @@ def measure_use(
             # These seeds are far from those of `room_sets`.
             counts = resample_counts(len(scenes), resamples, (seed, 100 + number))
             columns[name] = {metric.key: _estimate(metric.key, measured, counts) for metric in USE}
-    missing = [key for key, found in columns["generated"].items() if found.value is None]
-    reasons = {key: _reason(key, sets["generated"], options) for key in missing}
+    missing = [metric for metric in USE if columns["generated"][metric.key].value is None]
+    reasons = {metric.key: _reason(metric, sets["generated"], options) for metric in missing}
     for found in columns.values():
-        for key in missing:
+        for key in reasons:
             del found[key]
     return Used(columns, reasons)
 
@@ -89,7 +88,7 @@ def measure_room(scene: Scene, options: UseOptions) -> Counts:
     found: dict[str, tuple[float | int, float | int]] = {}
     functions: dict[Callable[..., Any], None] = dict.fromkeys(metric.function for metric in USE)
     for function in functions:
-        if function is not stability.stable_count or _simulated(scene, options):
+        if function is not stable_count or _simulated(scene, options):
             found |= function(scene)
     return found
 
@@ -107,18 +106,15 @@ def _estimate(key: str, measured: Sequence[Counts], counts: np.ndarray) -> Estim
     return ratio(pairs[:, 0], pairs[:, 1], counts, np.inf if litres else 1.0)
 
 
-def _reason(key: str, scenes: Sequence[Scene], options: UseOptions) -> str:
-    if key in {metric.key for metric in stability.METRICS}:
+def _reason(metric: Metric, scenes: Sequence[Scene], options: UseOptions) -> str:
+    if metric.function is stable_count:
         if options.settle == "none":
             return "--settle solids"
         if find_spec("mujoco") is None:
             return "mujoco (pip install 'sceneprior[sim]')"
-        return "solids of the objects (--settle all divides meshes, a minute or two each)"
-    if not any(scene.objects for scene in scenes):
+    elif not any(scene.objects for scene in scenes):
         return "objects in the scenes"
-    if key in {metric.key for metric in clearance.METRICS}:
-        return "doors or windows (openings) in the scenes"
-    return "a floor (floor_m) in the scenes"
+    return metric.needs
 
 
 def real_and_random(shards: Path, split: str, count: int, seed: int) -> dict[str, Sequence[Scene]]:
@@ -179,7 +175,7 @@ def evaluate_use(
         **{f"n_{name}": len(scenes) for name, scenes in sets.items()},
         "left_out": {**scores["protocol"].get("left_out", {}), **found.left_out},
         "use": {
-            **use_definitions(),
+            **{name: entry for metric in USE for name, entry in metric.protocol.items()},
             "settle": use.settle,
             "stand": use.stand,
             "n_with_floor": floors,

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sceneprior.evaluation.bootstrap import COVERAGE, Estimate, ratio, resample_counts
-from sceneprior.evaluation.metrics.frechet import frechet_distance
+from sceneprior.evaluation.metric import COVERAGE, Estimate, ratio, resample_counts
+from sceneprior.evaluation.metrics.picture_distances import frechet_distance
 
 
 def test_every_resample_has_as_many_rooms_and_seeds_repeat():
@@ -54,12 +54,13 @@ def test_ratios_leave_out_what_weighs_nothing_and_stay_in_their_range():
 def test_estimates_are_compared_resample_by_resample():
     a = Estimate(0.6, np.array([0.5, 0.7, 0.9]), 0.0, 1.0)
     b = Estimate(0.3, np.array([0.25, 0.0]), 0.0, 1.0)
-    assert a.over(b).value == 2 and a.over(b).resamples.tolist() == [2.0]  # 0.7 / 0 is nothing
-    assert a.minus(b).value == 0.3 and a.minus(b).resamples.tolist() == [0.25, 0.7]
+    over, minus = a.combined(b, np.divide), a.combined(b, np.subtract)
+    assert over.value == 2 and over.resamples.tolist() == [2.0]  # 0.7 / 0 is nothing
+    assert minus.value == 0.3 and minus.resamples.tolist() == [0.25, 0.7]
     nothing = Estimate(None, np.zeros(0))
-    for estimate in (a.over(nothing), nothing.over(a), a.minus(nothing), nothing.minus(a)):
+    for estimate in (a.combined(nothing, np.divide), nothing.combined(a, np.subtract)):
         assert estimate.value is None and estimate.interval() is None
-    assert a.over(Estimate(0.0, np.zeros(2))).value is None
+    assert a.combined(Estimate(0.0, np.zeros(2)), np.divide).value is None
 
 
 def test_nothing_to_weigh_is_no_estimate_and_no_nan():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sceneprior.core.scene import Scene, SceneObject
-from sceneprior.evaluation.layout_distance import layout_distance, nearest_distances, nearest_known
+from sceneprior.evaluation.metrics.novelty import layout_distance, nearest_distances, nearest_known
 
 LABELS = ("desk", "chair", "sofa")
 

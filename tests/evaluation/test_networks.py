@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from sceneprior.core.errors import InputError
-from sceneprior.evaluation.networks import (
+from sceneprior.evaluation.features import (
     efficientnet_lite0_features,
     inception_features,
     single_threaded,

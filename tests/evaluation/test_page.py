@@ -18,8 +18,13 @@ import sceneprior.evaluation
 from sceneprior.core.boxes import BOX_FACES
 from sceneprior.core.scene import Mesh, Opening, Scene, SceneObject
 from sceneprior.core.surfaces import surface_of
-from sceneprior.evaluation.page import FACES_PER_PAGE, faces_per_object, glb_of
-from sceneprior.evaluation.rooms_page import ROOMS_SHOWN, write_rooms_page
+from sceneprior.evaluation.page import (
+    FACES_PER_PAGE,
+    ROOMS_SHOWN,
+    faces_per_object,
+    glb_of,
+    write_rooms_page,
+)
 
 VIEWER = Path(sceneprior.evaluation.__file__).parent / "model_viewer"
 WITHOUT_WEBGL = """

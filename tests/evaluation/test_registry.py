@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from sceneprior.evaluation.registry import DECODED, METRICS, USE
+from sceneprior.evaluation.metrics import DECODED, METRICS, USE
 
 DOCS = Path(__file__).parents[2] / "docs" / "evaluation.md"
 BETTER = {"closer": "lower", "lower": "lower", "higher": "higher", "half": "0.5", "none": "–"}

@@ -13,9 +13,8 @@ from toy_metrics import without_classifiers
 
 from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.scene import Opening, Scene, SceneObject
-from sceneprior.evaluation.report import write_report
-from sceneprior.evaluation.report_pictures import input_views, legend, room_pictures
-from sceneprior.evaluation.rooms_page import write_rooms_page
+from sceneprior.evaluation.page import legend, room_pictures, write_rooms_page
+from sceneprior.evaluation.report import input_views, write_report
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
 from sceneprior.render.appearance import FLOOR_COLOR, quiet_colors
 from sceneprior.render.floor_plans import DOOR

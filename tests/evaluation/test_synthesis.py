@@ -18,10 +18,9 @@ from sceneprior.core.ground_truth import independent_rooms, reference_scenes
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.evaluation import synthesis
 from sceneprior.evaluation.features import Drawing
-from sceneprior.evaluation.metrics import classifier
+from sceneprior.evaluation.metrics import METRICS, picture_classifiers
 from sceneprior.evaluation.metrics.contents import category_kl, class_frequencies
-from sceneprior.evaluation.metrics.frechet import frechet_distance, gap_closed
-from sceneprior.evaluation.registry import METRICS
+from sceneprior.evaluation.metrics.picture_distances import frechet_distance, gap_closed
 from sceneprior.evaluation.room_sets import seeded_rows
 from sceneprior.evaluation.score_table import headings, print_scores, score_rows
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
@@ -272,7 +271,7 @@ def test_the_papers_classifier_appears_with_its_weights(
     path = tmp_path / "alexnet.pth"
     path.write_bytes(b"weights")
     monkeypatch.setattr(synthesis, "check_alexnet", lambda path: None)
-    monkeypatch.setattr(classifier, "classify_pictures", stand_in)
+    monkeypatch.setattr(picture_classifiers, "classify_pictures", stand_in)
     scores = evaluate_synthesis(generated, shards, EvalOptions(alexnet=path, resamples=5))
     assert scores["sca"] == scores["train_rooms"]["sca"] == 0.5
     assert set(seen) == {((224, 224, 3), np.dtype("uint8"))}

@@ -63,7 +63,7 @@ def synthesize(
     check_free(out, overwrite)  # before imports that take seconds
     from sceneprior.apps.api import load
     from sceneprior.apps.rooms import PAGE_FILE, write_scenes
-    from sceneprior.evaluation.rooms_page import write_rooms_page
+    from sceneprior.evaluation.page import write_rooms_page
 
     drawn = checked_shell(shell or "none")
     asked = request_of(floor, openings, ceiling, want, request)

@@ -18,7 +18,7 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.files import only_writer
 from sceneprior.core.ground_truth import known_in_3d
 from sceneprior.core.shards import iterate_rooms
-from sceneprior.evaluation.networks import check_inception
+from sceneprior.evaluation.features import check_inception
 
 OF_SHARDS = "shards"
 """Value of `cad_models` that selects the CAD models of the training rooms."""

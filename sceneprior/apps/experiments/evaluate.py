@@ -20,7 +20,7 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.files import write_json
 from sceneprior.core.ground_truth import known_in_3d, reference_scenes
 from sceneprior.core.scene import Scene
-from sceneprior.evaluation.metrics.decoded_rooms import reconstruction_scores
+from sceneprior.evaluation.metrics.contents import reconstruction_scores
 from sceneprior.evaluation.report import ROOMS_SHOWN, write_report
 from sceneprior.evaluation.room_sets import seeded_rows
 from sceneprior.evaluation.synthesis import FORMAT, EvalOptions, evaluate_synthesis

@@ -16,16 +16,15 @@ from sceneprior.core.meshes import place
 from sceneprior.core.scene import Scene
 from sceneprior.core.shards import iterate_rooms, list_shards
 from sceneprior.core.views import SceneViews
-from sceneprior.evaluation.bootstrap import METHOD, Estimate, mean_of_rooms, resample_counts
+from sceneprior.evaluation.metric import METHOD, Estimate, emptiness, mean_of_rooms, resample_counts
+from sceneprior.evaluation.metrics import METRICS
 from sceneprior.evaluation.metrics.contents import (
     TYPE_CLASSES,
     category_kl_of_counts,
     class_counts,
     common_label_set,
-    emptiness,
 )
 from sceneprior.evaluation.metrics.overlaps import room_overlaps
-from sceneprior.evaluation.registry import METRICS
 from sceneprior.evaluation.synthesis import EvalOptions, result_of
 from sceneprior.paper.config import PaperConfig
 from sceneprior.paper.matching import match_objects

@@ -14,7 +14,7 @@ from sceneprior.apps.experiments.comparison import Comparison, ViewComparison
 from sceneprior.apps.experiments.runs import LIFTED, PAPER, Run, Variant, variants_of
 from sceneprior.core.files import write_whole
 from sceneprior.evaluation.metric import ARROWS, TableColumn
-from sceneprior.evaluation.registry import DECODED, METRICS
+from sceneprior.evaluation.metrics import DECODED, METRICS
 from sceneprior.lifted.config import SAMPLER
 from sceneprior.paper.sampling import marked
 from sceneprior.training.checkpoints import read_checkpoint

@@ -15,8 +15,7 @@ from sceneprior.core.classes import label_set
 from sceneprior.core.files import write_whole
 from sceneprior.core.observed_image import ObservedImage
 from sceneprior.core.scene import Scene
-from sceneprior.evaluation.page import png_uri
-from sceneprior.evaluation.rooms_page import write_rooms_page
+from sceneprior.evaluation.page import png_uri, write_rooms_page
 from sceneprior.render.appearance import object_colors, quiet_colors, scene_meshes
 from sceneprior.render.offscreen import SoftwareRenderer
 from sceneprior.render.pictures import paint_ids, png_bytes

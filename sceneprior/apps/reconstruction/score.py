@@ -18,9 +18,14 @@ from sceneprior.core.ground_truth import models_of, reference_scenes
 from sceneprior.core.observed_image import ObservedImage, image_of_room, images_of_split
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.shards import iterate_rooms
-from sceneprior.evaluation.metrics.mesh_metrics import POINTS
 from sceneprior.evaluation.score_table import wide_console
-from sceneprior.evaluation.view_scores import PROTOCOL, ObjectPair, score_views, surface_note
+from sceneprior.evaluation.view_scores import (
+    POINTS,
+    PROTOCOL,
+    ObjectPair,
+    score_views,
+    surface_note,
+)
 from sceneprior.lifted.reconstruction.known_rooms import (
     known_rooms,
     nearest_answers,

@@ -16,8 +16,8 @@ from sceneprior.apps.api import Prior
 from sceneprior.apps.viewer.latent_map import LatentMap, make_map
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene
-from sceneprior.evaluation.layout_distance import nearest_room
 from sceneprior.evaluation.metrics.contents import common_label_set
+from sceneprior.evaluation.metrics.novelty import nearest_room
 from sceneprior.lifted.config import SAMPLER, TrainedLifted
 from sceneprior.lifted.prototype_decoder import PrototypeDecoder
 from sceneprior.paper.decode import decode_latents, to_rooms

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from sceneprior.core.scene import Scene
-from sceneprior.evaluation.metric import USED, Counts, Metric
+from sceneprior.evaluation.metric import USED, Counts, metric
 from sceneprior.evaluation.surfaces import (
     Triangles,
     area_centroid,
@@ -95,6 +95,11 @@ def _boxes_meet(a: Triangles, b: Triangles) -> bool:
     return bool((np.minimum(a_high, b_high) >= np.maximum(a_low, b_low)).all())
 
 
+@metric(
+    "sceneeval_col_objects", "COL: objects that collide (SceneEval)", "share", "lower", USED,
+    protocol={"surfaces": "meshes of the scenes; boxes of objects without a mesh"},
+)  # fmt: skip
+@metric("sceneeval_col_scenes", "COL: rooms with a collision (SceneEval)", "share", "lower", USED)
 def _sceneeval(scene: Scene) -> Counts:
     found = colliding(scene)
     return {
@@ -103,20 +108,13 @@ def _sceneeval(scene: Scene) -> Counts:
     }
 
 
+@metric("physcene_col_objects", "Col_obj: objects that collide (PhyScene)", "share", "lower", USED)
+@metric(
+    "physcene_col_scenes", "Col_scene: rooms with a collision (PhyScene)", "share", "lower", USED
+)
 def _physcene(scene: Scene) -> Counts:
     found = containing(scene)
     return {
         "physcene_col_objects": (float(found.sum()), len(found)),
         "physcene_col_scenes": (float(found.any()), 1),
     }
-
-
-METRICS = tuple(
-    Metric(key, title, "share", "lower", function, USED)
-    for key, title, function in (
-        ("sceneeval_col_objects", "COL: objects that collide (SceneEval)", _sceneeval),
-        ("sceneeval_col_scenes", "COL: rooms with a collision (SceneEval)", _sceneeval),
-        ("physcene_col_objects", "Col_obj: objects that collide (PhyScene)", _physcene),
-        ("physcene_col_scenes", "Col_scene: rooms with a collision (PhyScene)", _physcene),
-    )
-)

@@ -1,21 +1,25 @@
-"""Metrics of room contents: class frequencies, numbers of objects, furniture of a room type."""
+"""Metrics of room contents: class frequencies, numbers of objects, furniture of a room type; and
+objects of decoded training rooms that match the ground truth."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from sceneprior.core.classes import LABEL_SETS, VOID, label_set
 from sceneprior.core.errors import InputError
+from sceneprior.core.overlaps import SceneMatch, match_scenes
 from sceneprior.core.scene import Scene
-from sceneprior.evaluation.bootstrap import Estimate
 from sceneprior.evaluation.metric import (
     AGAINST_TEST,
+    MATCHED,
     Comparison,
-    Metric,
+    Estimate,
     RoomSet,
     TableColumn,
     mean_over_rooms,
+    metric,
+    object_count,
 )
 
 KL_EPSILON = 1e-6
@@ -72,30 +76,6 @@ def category_kl(p: Float[np.ndarray, " classes"], q: Float[np.ndarray, " classes
     return float((p * (np.log(p + KL_EPSILON) - np.log(q + KL_EPSILON))).sum())
 
 
-def object_counts(scenes: Sequence[Scene]) -> Int[np.ndarray, "scenes"]:
-    """Number of objects in each scene, void left out."""
-    return np.array([_count(scene) for scene in scenes], dtype=np.int64)
-
-
-def _count(scene: Scene) -> int:
-    return int((scene.class_indices != VOID).sum())
-
-
-def emptiness(scenes: Sequence[Scene]) -> str | None:
-    """A warning if more than half of the generated rooms are empty; else None.
-
-    Metrics of empty rooms mislead: no objects intersect, and a blank picture easily lies in the
-    ball around a real room's picture, which raises precision.
-    """
-    empty = int((object_counts(scenes) == 0).sum())
-    if 2 * empty <= len(scenes):
-        return None
-    return (
-        f"{empty} of {len(scenes)} generated rooms are empty, so none of the other scores can be "
-        "trusted: train longer."
-    )
-
-
 def type_share(scenes: Sequence[Scene]) -> float | None:
     """Share of the scenes that hold the furniture of their room type (`TYPE_CLASSES`).
 
@@ -122,27 +102,69 @@ def category_kl_of_counts(
     return Estimate(value, np.array([category_kl(p, q) for p, q in pairs]), 0.0)
 
 
+@metric(
+    "category_kl", "Category KL to test rooms", "nats", "closer", AGAINST_TEST,
+    protocol={"category_kl": f"KL(test || generated) in nats, epsilon {KL_EPSILON}, without void"},
+    column=TableColumn("category KL", 3),
+)  # fmt: skip
 def _category_kl(rooms: RoomSet, comparison: Comparison) -> Estimate:
     test = comparison.test
     tables = class_counts(rooms.scenes), class_counts(test.scenes)
     return category_kl_of_counts(*tables, rooms.counts, test.counts)
 
 
-METRICS = (
-    Metric(
-        "category_kl", "Category KL to test rooms", "nats", "closer", _category_kl, AGAINST_TEST,
-        protocol={
-            "category_kl": f"KL(test || generated) in nats, epsilon {KL_EPSILON}, without void"
-        },
-        column=TableColumn("category KL", 3),
-    ),
-    Metric(
-        "mean_objects", "Objects in a room", "mean", "none", mean_over_rooms(_count),
-        column=TableColumn("objects", 2),
-    ),
-    Metric(
-        "type_share", "Rooms that hold their type's furniture", "share", "higher",
-        mean_over_rooms(_holds_its_type, 1.0),
-        column=TableColumn("type", 2, "type: rooms that hold the furniture their type needs"),
+metric("mean_objects", "Objects in a room", "mean", "none", column=TableColumn("objects", 2))(
+    mean_over_rooms(object_count)
+)
+metric(
+    "type_share", "Rooms that hold their type's furniture", "share", "higher",
+    column=TableColumn("type", 2, "type: rooms that hold the furniture their type needs"),
+)(mean_over_rooms(_holds_its_type, 1.0))  # fmt: skip
+
+
+def reconstruction_scores(pairs: Sequence[tuple[Scene, Scene]]) -> dict[str, float | int | None]:
+    """Scores of (decoded, true) rooms: the metrics of `MATCHED` rooms by key, and the numbers of
+    rooms and objects.
+
+    Every true object has the same weight. Scores of objects are None if no room holds any.
+    """
+    matches = [match_scenes(decoded, truth) for decoded, truth in pairs]
+    objects = sum(match.truth_count for match in matches)
+    decoded = (_class_accuracy, _box_iou_3d, _count_accuracy)
+    scores = {function.__name__.strip("_"): function(matches) for function in decoded}
+    return {**scores, "rooms": len(pairs), "objects": objects}
+
+
+def _mean_over_objects(
+    matches: Sequence[SceneMatch], value: Callable[[SceneMatch], np.ndarray]
+) -> float | None:
+    """The mean over true objects of one value each, 0 for those without a match."""
+    objects = sum(match.truth_count for match in matches)
+    total = sum(float(value(match).sum()) for match in matches)
+    return total / objects if objects else None
+
+
+@metric(
+    "class_accuracy", "Classes of decoded training rooms", "share of objects", "higher", MATCHED
+)
+def _class_accuracy(matches: Sequence[SceneMatch]) -> float | None:
+    return _mean_over_objects(matches, lambda match: match.correct)
+
+
+@metric(
+    "box_iou_3d", "Box IoU of decoded training rooms", "IoU", "higher", MATCHED,
+    column=TableColumn(
+        "train box IoU", 2, "train box IoU: decoded training rooms against the truth"
     ),
 )  # fmt: skip
+def _box_iou_3d(matches: Sequence[SceneMatch]) -> float | None:
+    return _mean_over_objects(matches, lambda match: match.iou)
+
+
+@metric(
+    "count_accuracy", "Numbers of objects of decoded training rooms", "share of rooms", "higher",
+    MATCHED,
+)  # fmt: skip
+def _count_accuracy(matches: Sequence[SceneMatch]) -> float | None:
+    same = sum(match.decoded_count == match.truth_count for match in matches)
+    return same / len(matches) if matches else None

@@ -1,19 +1,29 @@
 """Metrics of the floor: objects outside its outline, and the walkable area between objects.
 
-An object's footprint is its axis-aligned box on the floor (x, z). Areas are exact (shapely), except
-that rounded corners are polygons of `ARC_SEGMENTS` sides per quarter turn.
-"""
+Areas of footprints (axis-aligned boxes on the floor, x and z) are exact (shapely), except that
+rounded corners are polygons of `ARC_SEGMENTS` sides per quarter turn."""
 
 from functools import partial
 
 import numpy as np
 import shapely
+from jaxtyping import Bool
 
 from sceneprior.core.classes import VOID
 from sceneprior.core.outline import floor_polygon
 from sceneprior.core.scene import Scene
-from sceneprior.evaluation.bootstrap import Estimate, ratio
-from sceneprior.evaluation.metric import Comparison, Metric, RoomSet, mean_over_rooms
+from sceneprior.core.surfaces import surface_points
+from sceneprior.evaluation.metric import (
+    USED,
+    Comparison,
+    Counts,
+    Estimate,
+    RoomSet,
+    mean_over_rooms,
+    metric,
+    ratio,
+)
+from sceneprior.evaluation.surfaces import FLUSH_M, own_box, triangles_of
 
 AGENT_RADIUS_M = 0.2
 AGENT_HEIGHT_M = 1.5
@@ -21,6 +31,10 @@ AGENT_HEIGHT_M = 1.5
 OUTSIDE_SHARE = 0.05
 """Share of an object's footprint outside the floor above which it is out of bounds."""
 ARC_SEGMENTS = 8
+INSIDE_SHARE = 0.99
+"""Minimum share of an object's surface points above the floor for the object to be in bounds."""
+POINTS_PER_M3, FEWEST_POINTS = 5000, 1000
+"""Surface points per cubic metre of the object's box, and their minimum number."""
 
 
 def footprints(scene: Scene, below_m: float = np.inf) -> np.ndarray:
@@ -81,33 +95,64 @@ def walkable_share(scene: Scene, within: str = "furniture") -> float | None:
     return float(pieces.max() / pieces.sum()) if pieces.sum() > 0 else 0.0
 
 
+@metric(
+    "out_of_bounds_share", "Pieces out of the floor's bounds", "share; known floors only", "lower",
+    protocol={
+        "out_of_bounds_share": f"pieces with more than {OUTSIDE_SHARE:.0%} of their box outside "
+        "floor_m; rooms without floor_m are left out"
+    },
+)  # fmt: skip
 def _out_of_bounds(rooms: RoomSet, comparison: Comparison) -> Estimate:
     outside, pieces = np.array([outside_count(scene) for scene in rooms.scenes], dtype=float).T
     return ratio(outside, pieces, rooms.counts, 1.0)
 
 
-METRICS = (
-    Metric(
-        "out_of_bounds_share", "Pieces out of the floor's bounds", "share; known floors only",
-        "lower",
-        _out_of_bounds,
-        protocol={
-            "out_of_bounds_share": f"pieces with more than {OUTSIDE_SHARE:.0%} of their box "
-            "outside floor_m; rooms without floor_m are left out"
-        },
-    ),
-    Metric(
-        "walkable_share", "Walkable in one piece, between furniture", "share of free floor",
-        "higher",
-        mean_over_rooms(walkable_share, 1.0),
-        protocol={
-            "walkable_share": f"disc of {AGENT_RADIUS_M} m, {AGENT_HEIGHT_M} m high; exact areas; "
-            "_floor: within floor_m, else the rectangle around all furniture"
-        },
-    ),
-    Metric(
-        "walkable_share_floor", "Walkable in one piece, within the floor",
-        "share; known floors only", "higher",
-        mean_over_rooms(partial(walkable_share, within="floor"), 1.0),
-    ),
+metric(
+    "walkable_share", "Walkable in one piece, between furniture", "share of free floor", "higher",
+    protocol={
+        "walkable_share": f"disc of {AGENT_RADIUS_M} m, {AGENT_HEIGHT_M} m high; exact areas; "
+        "_floor: within floor_m, else the rectangle around all furniture"
+    },
+)(mean_over_rooms(walkable_share, 1.0))  # fmt: skip
+metric(
+    "walkable_share_floor", "Walkable in one piece, within the floor", "share; known floors only",
+    "higher",
+)(mean_over_rooms(partial(walkable_share, within="floor"), 1.0))  # fmt: skip
+
+
+def out_of_bounds(scene: Scene) -> Bool[np.ndarray, " objects"] | None:
+    """True for objects with less than 99% of their surface over the floor: SceneEval's OOB.
+
+    The surface is represented by `max(1000, 5000 * volume of the box in m3)` points, drawn
+    uniformly by area. A point is in bounds if the floor is below it. None if there is no floor.
+
+    Source:
+        3dlg-hcvc/SceneEval, metrics/out_of_bound.py. There the box is the smallest oriented one,
+        and the floor lies at the lowest point of all objects, so that no point is below it; here
+        the box is the object's own (axis-aligned if its yaw is unknown), heights are ignored, and
+        the floor is 1 mm wider on all sides (`FLUSH_M`).
+    """
+    floor = floor_polygon(scene)
+    if floor is None:
+        return None
+    floor = floor.buffer(FLUSH_M, join_style="mitre")
+    shapely.prepare(floor)
+    found = []
+    for row, item in enumerate(scene.objects):
+        triangles = triangles_of(item)
+        count = max(int(np.prod(own_box(item).size_m) * POINTS_PER_M3), FEWEST_POINTS)
+        corners = triangles.reshape(-1, 3)
+        points = surface_points(corners, np.arange(len(corners)).reshape(-1, 3), count, seed=row)
+        within = shapely.contains_xy(floor, points[:, 0], points[:, 2])
+        found.append(within.mean() < INSIDE_SHARE)
+    return np.array(found, dtype=bool)
+
+
+@metric(
+    "sceneeval_oob_objects", "OOB: objects out of bounds (SceneEval)", "share; known floors only",
+    "lower", USED,
 )  # fmt: skip
+def _oob(scene: Scene) -> Counts:
+    found = out_of_bounds(scene)
+    pair = (0.0, 0.0) if found is None else (float(found.sum()), len(found))
+    return {"sceneeval_oob_objects": pair}

@@ -8,15 +8,23 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float, Int
-from sklearn.ensemble import GradientBoostingClassifier
-from sklearn.model_selection import KFold
 
 from sceneprior.core.classes import label_set
 from sceneprior.core.overlaps import intersection_volumes
 from sceneprior.core.scene import Scene
-from sceneprior.evaluation.bootstrap import Estimate, mean_of_rooms, ratio, resample_counts
-from sceneprior.evaluation.metric import AGAINST_TEST, Comparison, Metric, RoomSet, TableColumn
-from sceneprior.evaluation.metrics.classifier import FOLDS
+from sceneprior.evaluation.metric import (
+    AGAINST_TEST,
+    Comparison,
+    Estimate,
+    RoomSet,
+    TableColumn,
+    mean_of_rooms,
+    mean_of_shares,
+    metric,
+    ratio,
+    resample_counts,
+)
+from sceneprior.evaluation.metrics.picture_classifiers import FOLDS
 
 JITTER_M = 0.07
 """Standard deviation of the noise added to every centre and size of both sets. Real boxes touch
@@ -97,6 +105,8 @@ def boosted_trees(
 
     Each split considers a random subset of the features. Both labels have the same total weight.
     """
+    from sklearn.ensemble import GradientBoostingClassifier
+
     varied = features.std(0) > 0  # most pairs of classes never occur together
     if not varied.any():
         return np.zeros(len(others), dtype=int)
@@ -108,7 +118,23 @@ def boosted_trees(
     return np.asarray(model.predict(others[:, varied]), dtype=int)
 
 
-def _accuracy(rooms: RoomSet, comparison: Comparison) -> Estimate:
+@metric(
+    "layout_classifier_accuracy", "Classifier accuracy, layouts", "", "half", AGAINST_TEST,
+    protocol={
+        "layout_classifier_accuracy": f"gradient boosting ({TREES} trees, depth 3, square root "
+        f"of the features per split), noise of {JITTER_M} m; trained on all real training and "
+        f"val rooms and {FOLDS - 1}/{FOLDS} of the set (at most as many rooms), evaluated on "
+        "the test rooms and the rest of the set; equal total weight for real and other rooms; "
+        "interval: over evaluated rooms, classifiers not retrained"
+    },
+    column=TableColumn(
+        "layout classifier", 2,
+        "layout classifier: accuracy of a classifier of boxes and their relations",
+    ),
+)  # fmt: skip
+def layout_classifier_accuracy(rooms: RoomSet, comparison: Comparison) -> Estimate:
+    from sklearn.model_selection import KFold
+
     scenes, counts, real = rooms.scenes, rooms.counts, comparison.real
     if any(scene is other for scene in scenes[:1] for other in real):
         # To score the real training rooms, the classifier separates two halves of the real rooms.
@@ -130,23 +156,4 @@ def _accuracy(rooms: RoomSet, comparison: Comparison) -> Estimate:
         right_test += answers[: len(judged)] == 0
         right[fresh] = answers[len(judged) :] == 1
     of_test = ratio(right_test, np.full(len(judged), folds.n_splits), test.counts)
-    return mean_of_rooms(right, counts).mean_with(of_test)
-
-
-METRICS = (
-    Metric(
-        "layout_classifier_accuracy", "Classifier accuracy, layouts", "", "half",
-        _accuracy, AGAINST_TEST,
-        protocol={
-            "layout_classifier_accuracy": f"gradient boosting ({TREES} trees, depth 3, square root "
-            f"of the features per split), noise of {JITTER_M} m; trained on all real training and "
-            f"val rooms and {FOLDS - 1}/{FOLDS} of the set (at most as many rooms), evaluated on "
-            "the test rooms and the rest of the set; equal total weight for real and other rooms; "
-            "interval: over evaluated rooms, classifiers not retrained"
-        },
-        column=TableColumn(
-            "layout classifier", 2,
-            "layout classifier: accuracy of a classifier of boxes and their relations",
-        ),
-    ),
-)  # fmt: skip
+    return mean_of_shares(mean_of_rooms(right, counts), of_test)

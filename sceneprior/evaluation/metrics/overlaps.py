@@ -8,8 +8,15 @@ from jaxtyping import Bool, Float, Int
 
 from sceneprior.core.classes import VOID
 from sceneprior.core.scene import Scene
-from sceneprior.evaluation.bootstrap import Estimate, mean_of_rooms
-from sceneprior.evaluation.metric import Comparison, Metric, RoomSet, TableColumn, mean_over_rooms
+from sceneprior.evaluation.metric import (
+    Comparison,
+    Estimate,
+    RoomSet,
+    TableColumn,
+    mean_of_rooms,
+    mean_over_rooms,
+    metric,
+)
 from sceneprior.evaluation.metrics.contents import class_counts
 
 OVERLAP_SHARE = 0.01
@@ -101,40 +108,35 @@ def _mean_of_pairs(
     return function
 
 
-METRICS = (
-    Metric(
-        "implausible_pairs", "Implausible intersecting pairs in a room", "mean", "lower",
-        _mean_of_pairs(lambda overlaps: overlaps.intersect, plausible=False),
-        protocol={"implausible_pairs": f"boxes sharing more than {OVERLAP_SHARE:.0%} of the "
-                  f"smaller one, classes that do so in under {PLAUSIBLE_SHARE:.0%} of the real "
-                  "training rooms that hold both"},
-        column=TableColumn(
-            "implausible pairs", 2,
-            "implausible pairs: intersecting pairs per room, of classes that seldom intersect in "
-            "real training rooms",
-        ),
+metric(
+    "implausible_pairs", "Implausible intersecting pairs in a room", "mean", "lower",
+    protocol={
+        "implausible_pairs": f"boxes sharing more than {OVERLAP_SHARE:.0%} of the smaller one, "
+        f"classes that do so in under {PLAUSIBLE_SHARE:.0%} of the real training rooms that hold "
+        "both"
+    },
+    column=TableColumn(
+        "implausible pairs", 2,
+        "implausible pairs: intersecting pairs per room, of classes that seldom intersect in "
+        "real training rooms",
     ),
-    Metric(
-        "deep_pairs", "Implausible pairs deeper than 1 cm", "mean", "lower",
-        _mean_of_pairs(lambda overlaps: overlaps.depths_m > DEEP_M, plausible=False),
-        protocol={"deep_pairs": f"penetration over {DEEP_M} m, classes as in implausible_pairs"},
-        column=TableColumn("deeper than 1 cm", 2, "deeper than 1 cm: such pairs by depth"),
+)(_mean_of_pairs(lambda overlaps: overlaps.intersect, plausible=False))  # fmt: skip
+metric(
+    "deep_pairs", "Implausible pairs deeper than 1 cm", "mean", "lower",
+    protocol={"deep_pairs": f"penetration over {DEEP_M} m, classes as in implausible_pairs"},
+    column=TableColumn("deeper than 1 cm", 2, "deeper than 1 cm: such pairs by depth"),
+)(_mean_of_pairs(lambda overlaps: overlaps.depths_m > DEEP_M, plausible=False))  # fmt: skip
+metric("implausible_litres", "Volume shared by implausible pairs", "mean, litres", "lower")(
+    _mean_of_pairs(lambda overlaps: 1000 * overlaps.volumes_m3, plausible=False)
+)
+metric(
+    "plausible_pairs", "Plausible intersecting pairs in a room", "mean", "none",
+    column=TableColumn(
+        "plausible pairs", 2,
+        "plausible pairs: all other intersecting pairs, such as chairs under tables; near the "
+        "real rooms' number is good",
     ),
-    Metric(
-        "implausible_litres", "Volume shared by implausible pairs", "mean, litres", "lower",
-        _mean_of_pairs(lambda overlaps: 1000 * overlaps.volumes_m3, plausible=False),
-    ),
-    Metric(
-        "plausible_pairs", "Plausible intersecting pairs in a room", "mean", "none",
-        _mean_of_pairs(lambda overlaps: overlaps.intersect, plausible=True),
-        column=TableColumn(
-            "plausible pairs", 2,
-            "plausible pairs: all other intersecting pairs, such as chairs under tables; near the "
-            "real rooms' number is good",
-        ),
-    ),
-    Metric(
-        "overlap_volume_m3", "Volume shared by all pairs in a room", "mean, cubic metres", "none",
-        mean_over_rooms(lambda scene: float(room_overlaps(scene).volumes_m3.sum())),
-    ),
-)  # fmt: skip
+)(_mean_of_pairs(lambda overlaps: overlaps.intersect, plausible=True))  # fmt: skip
+metric("overlap_volume_m3", "Volume shared by all pairs in a room", "mean, cubic metres", "none")(
+    mean_over_rooms(lambda scene: float(room_overlaps(scene).volumes_m3.sum()))
+)

@@ -13,14 +13,14 @@ from jaxtyping import Float, Int
 
 from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.scene import Scene
-from sceneprior.evaluation.bootstrap import Estimate
 from sceneprior.evaluation.metric import (
     AGAINST_TEST,
     GENERATED,
     Comparison,
-    Metric,
+    Estimate,
     RoomSet,
     TableColumn,
+    metric,
 )
 
 PAIR_SHARE = 0.05
@@ -136,7 +136,20 @@ def pair_distances(rooms: RoomSet, comparison: Comparison) -> PairDistances:
     return PairDistances(pairs, np.array(values), np.reshape(resamples, shape), weights)
 
 
-def _distance(rooms: RoomSet, comparison: Comparison) -> Estimate:
+@metric(
+    "relation_distance_m", "Relations: gaps between classes", "mean over pairs, metres", "closer",
+    AGAINST_TEST,
+    protocol={
+        "relation_distance_m": f"ordered pairs that {PAIR_SHARE:.0%} of the real training and "
+        f"val rooms have, gaps between footprints up to {FAR_M} m, Wasserstein-1 distance from "
+        "the test rooms' gaps, mean over pairs weighted by their number in the test rooms"
+    },
+    column=TableColumn(
+        "relations (m)", 3,
+        "relations: mean Wasserstein distance of gaps between classes from the test rooms'",
+    ),
+)  # fmt: skip
+def relation_distance(rooms: RoomSet, comparison: Comparison) -> Estimate:
     found = pair_distances(rooms, comparison)
     if not found.pairs:
         return Estimate(None, np.zeros(0))
@@ -149,9 +162,12 @@ def _distance(rooms: RoomSet, comparison: Comparison) -> Estimate:
     return Estimate(float(found.weights @ found.values_m), means, 0.0)
 
 
+@metric(
+    "relation_ratio", "The same, over that of real rooms", "1: as near as real", "lower", GENERATED
+)
 def _ratio(rooms: RoomSet, comparison: Comparison) -> Estimate:
-    columns = comparison.columns
-    return _distance(rooms, comparison).over(columns["train_rooms"]["relation_distance_m"])
+    real = comparison.columns["train_rooms"]["relation_distance_m"]
+    return relation_distance(rooms, comparison).combined(real, np.divide, low=0.0)
 
 
 def furthest_pairs(rooms: RoomSet, train: RoomSet, comparison: Comparison) -> list[dict[str, Any]]:
@@ -180,25 +196,3 @@ def furthest_pairs(rooms: RoomSet, train: RoomSet, comparison: Comparison) -> li
         }
         for row in np.argsort(-beyond, kind="stable")[:LISTED]
     ]
-
-
-METRICS = (
-    Metric(
-        "relation_distance_m", "Relations: gaps between classes", "mean over pairs, metres",
-        "closer",
-        _distance, AGAINST_TEST,
-        protocol={
-            "relation_distance_m": f"ordered pairs that {PAIR_SHARE:.0%} of the real training and "
-            f"val rooms have, gaps between footprints up to {FAR_M} m, Wasserstein-1 distance from "
-            "the test rooms' gaps, mean over pairs weighted by their number in the test rooms"
-        },
-        column=TableColumn(
-            "relations (m)", 3,
-            "relations: mean Wasserstein distance of gaps between classes from the test rooms'",
-        ),
-    ),
-    Metric(
-        "relation_ratio", "The same, over that of real rooms", "1: as near as real", "lower",
-        _ratio, GENERATED,
-    ),
-)  # fmt: skip

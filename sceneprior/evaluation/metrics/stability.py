@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene
-from sceneprior.evaluation.metric import USED, Counts, Metric
+from sceneprior.evaluation.metric import USED, Counts, metric
 from sceneprior.render.scene_mjcf import TIMESTEP_S, scene_to_mjcf
 
 SECONDS = 5.0
@@ -60,6 +60,14 @@ def settle(scene: Scene, seconds: float = SECONDS) -> Settled:
     return Settled(moved, 2 * np.arccos(alike), max(depth, 0.0))
 
 
+@metric(
+    "stable_share", "Stable for 5 s in MuJoCo, as generated", "share of objects", "higher", USED,
+    needs="solids of the objects (--settle all divides meshes, a minute or two each)",
+    protocol={
+        "stability": f"{SECONDS:g} s of MuJoCo in the rooms as they are, without walls; "
+        f"moved at most {MOVED_M} m, turned at most {TURNED_RAD} rad"
+    },
+)  # fmt: skip
 def stable_count(scene: Scene) -> Counts:
     """Numbers of stable objects and of all objects of a scene, for `stable_share`."""
     stable = settle(scene).stable if scene.objects else np.zeros(0)
@@ -74,11 +82,3 @@ def _mujoco() -> Any:
             "Simulating rooms needs one more package: pip install 'sceneprior[sim]'."
         ) from None
     return mujoco
-
-
-METRICS = (
-    Metric(
-        "stable_share", "Stable for 5 s in MuJoCo, as generated", "share of objects", "higher",
-        stable_count, USED,
-    ),
-)  # fmt: skip

@@ -8,7 +8,7 @@ from sceneprior.core.boxes import yaw_rotation
 from sceneprior.core.colliders import support_of
 from sceneprior.core.outline import floor_rectangle, rectangle
 from sceneprior.core.scene import Scene, SceneObject
-from sceneprior.evaluation.metric import USED, Counts, Metric
+from sceneprior.evaluation.metric import USED, Counts, metric
 from sceneprior.evaluation.surfaces import (
     Points,
     Triangles,
@@ -160,15 +160,12 @@ def _planes(scene: Scene) -> dict[str, Triangles]:
     return found
 
 
+@metric(
+    "sceneeval_supported", "SUPPORT: objects that rest on something (SceneEval)", "share",
+    "higher", USED,
+    protocol={"support": "expected by class (support_of), floor at height 0"},
+)  # fmt: skip
 def _support(scene: Scene) -> Counts:
     found = supported(scene)
     known: Bool[np.ndarray, " objects"] = ~np.isnan(found)
     return {"sceneeval_supported": (float(found[known].sum()), float(known.sum()))}
-
-
-METRICS = (
-    Metric(
-        "sceneeval_supported", "SUPPORT: objects that rest on something (SceneEval)", "share",
-        "higher", _support, USED,
-    ),
-)  # fmt: skip

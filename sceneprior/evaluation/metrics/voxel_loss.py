@@ -9,7 +9,7 @@ from jaxtyping import Bool, Int
 from sceneprior.core.outline import floor_polygon
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.shell import ceiling_height
-from sceneprior.evaluation.metric import USED, Counts, Metric
+from sceneprior.evaluation.metric import USED, Counts, metric
 from sceneprior.evaluation.surfaces import (
     FLUSH_M,
     Voxels,
@@ -133,6 +133,16 @@ def _shared(a: Voxels, b: Voxels) -> int:
     return int((parts[0] & parts[1]).sum())
 
 
+_LITRES = "mean, litres; known floors only"
+
+
+@metric("respace_oob_litres", "OOB: volume out of the room (ReSpace)", _LITRES, "lower", USED)
+@metric("respace_mbl_litres", "MBL: volume shared by objects (ReSpace)", _LITRES, "lower", USED)
+@metric("respace_pbl_litres", "PBL: the sum of both (ReSpace)", _LITRES, "lower", USED)
+@metric(
+    "respace_valid", "Rooms with a PBL of at most 100 litres (ReSpace)",
+    "share; known floors only", "higher", USED,
+)  # fmt: skip
 def _respace(scene: Scene) -> Counts:
     found = voxel_loss(scene)
     if found is None:
@@ -143,19 +153,3 @@ def _respace(scene: Scene) -> Counts:
         "respace_pbl_litres": (1000 * found.pbl_m3, 1.0),
         "respace_valid": (float(found.pbl_m3 <= VALID_M3), 1.0),
     }
-
-
-METRICS = (
-    *(
-        Metric(key, title, "mean, litres; known floors only", "lower", _respace, USED)
-        for key, title in (
-            ("respace_oob_litres", "OOB: volume out of the room (ReSpace)"),
-            ("respace_mbl_litres", "MBL: volume shared by objects (ReSpace)"),
-            ("respace_pbl_litres", "PBL: the sum of both (ReSpace)"),
-        )
-    ),
-    Metric(
-        "respace_valid", "Rooms with a PBL of at most 100 litres (ReSpace)",
-        "share; known floors only", "higher", _respace, USED,
-    ),
-)  # fmt: skip

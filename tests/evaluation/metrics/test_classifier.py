@@ -6,9 +6,14 @@ import pytest
 import torch
 
 from sceneprior.core.errors import InputError
-from sceneprior.evaluation.alexnet import check_alexnet, classify_pictures
-from sceneprior.evaluation.bootstrap import resample_counts
-from sceneprior.evaluation.metrics.classifier import FOLDS, REPEATS, cross_validated_predictions
+from sceneprior.evaluation.metric import resample_counts
+from sceneprior.evaluation.metrics.picture_classifiers import (
+    FOLDS,
+    REPEATS,
+    check_alexnet,
+    classify_pictures,
+    cross_validated_predictions,
+)
 
 
 def accuracy(told, resamples: int = 50):

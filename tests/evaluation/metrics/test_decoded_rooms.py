@@ -7,7 +7,7 @@ import pytest
 from toy_metrics import of_classes, room
 
 from sceneprior.core.overlaps import box_iou_3d, match_scenes
-from sceneprior.evaluation.metrics.decoded_rooms import reconstruction_scores
+from sceneprior.evaluation.metrics.contents import reconstruction_scores
 
 
 def test_iou_agrees_with_volumes_counted_on_a_grid():

@@ -11,9 +11,13 @@ from torchmetrics.image.kid import KernelInceptionDistance
 from toy_metrics import Plain, fed
 
 from sceneprior.core.errors import InputError
-from sceneprior.evaluation.metrics.frechet import frechet_distance, gap_closed
-from sceneprior.evaluation.metrics.kernel_distance import kernel_distance, kernels
-from sceneprior.evaluation.metrics.precision_recall import in_manifold
+from sceneprior.evaluation.metrics.picture_distances import (
+    frechet_distance,
+    gap_closed,
+    in_manifold,
+    kernel_distance,
+    kernels,
+)
 
 
 def with_moments(count: int, mean: np.ndarray, covariance: np.ndarray, seed: int) -> np.ndarray:

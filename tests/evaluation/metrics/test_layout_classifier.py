@@ -9,8 +9,8 @@ from sceneprior.core.scene import Scene
 from sceneprior.evaluation.metrics import layout_classifier
 from sceneprior.evaluation.metrics.layout_classifier import (
     ABSENT,
-    METRICS,
     boosted_trees,
+    layout_classifier_accuracy,
     layout_features,
 )
 
@@ -95,7 +95,9 @@ def accuracy(rng):
     real = random_rooms(rng, 120)
 
     def of(scenes) -> float:
-        return METRICS[0].function(room_set(scenes, []), compared_with(test, real=real)).value
+        return layout_classifier_accuracy(
+            room_set(scenes, []), compared_with(test, real=real)
+        ).value
 
     of.real = real
     return of

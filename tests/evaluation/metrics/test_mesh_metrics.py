@@ -10,7 +10,7 @@ from scipy.spatial.distance import cdist
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Mesh
 from sceneprior.core.surfaces import chamfer_of, nearest_distances
-from sceneprior.evaluation.metrics.mesh_metrics import (
+from sceneprior.evaluation.view_scores import (
     OrientedBox,
     f_score,
     oriented_box,

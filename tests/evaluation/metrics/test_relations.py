@@ -8,9 +8,9 @@ from scipy.stats import wasserstein_distance
 from toy_metrics import compared_with, of_classes, room, room_set
 
 from sceneprior.core.classes import label_set
+from sceneprior.evaluation.metrics import METRICS
 from sceneprior.evaluation.metrics.relations import (
     FAR_M,
-    METRICS,
     common_pairs,
     furthest_pairs,
     nearest_gaps,

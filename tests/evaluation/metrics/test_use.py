@@ -7,10 +7,9 @@ import pytest
 import trimesh
 
 from sceneprior.core.scene import Mesh, Opening, Scene, SceneObject, Turned
-from sceneprior.evaluation.metrics.bounds import out_of_bounds
-from sceneprior.evaluation.metrics.clearance import clearances
 from sceneprior.evaluation.metrics.collisions import colliding, containing
-from sceneprior.evaluation.metrics.navigation import navigability, reach
+from sceneprior.evaluation.metrics.floor import out_of_bounds
+from sceneprior.evaluation.metrics.navigation import clearances, navigability, reach
 from sceneprior.evaluation.metrics.support import supported
 from sceneprior.evaluation.metrics.voxel_loss import voxel_loss
 from sceneprior.evaluation.use import UseOptions, measure_room, measure_use
