@@ -52,18 +52,8 @@ def check_config(data: dict[str, Any], source: str) -> RunConfig:
     Runs and packed priors of earlier versions have a section `samples`, which chose checkpoints.
     The section is dropped if it has no effect (`every` is 0 or missing), and refused otherwise.
     """
-    if "method" not in data and "stages" in data:
-        raise ConfigError(
-            f"{source} was written before methods had names (it says `stages`), and can no longer "
-            "be read; train it again with a current config, such as demo.yaml."
-        )
     data = without_samples(data, source)
     method = data.get("method")
-    if method == "ours":
-        raise ConfigError(
-            f"{source} was written when `method: ours` stood for two methods; they are now `paper` "
-            "and `lifted`, each with its own sections. Train it again with a current config."
-        )
     if not isinstance(method, str) or method not in METHODS:
         raise ConfigError(
             f"{source}: no method is called '{shortened(method)}'; choose from "
