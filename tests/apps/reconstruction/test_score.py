@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 from golden_values import assert_as_before
 from refusals import refused
@@ -10,7 +9,6 @@ from refusals import refused
 from sceneprior.apps.reconstruction.score import (
     SvrProtocol,
     evaluate_scenes,
-    known_model_share,
     scenes_with_images,
 )
 from sceneprior.apps.rooms import write_scenes
@@ -52,11 +50,3 @@ def test_scenes_that_do_not_match_an_image_are_refused(answers, toy_shards, tmp_
         write_scenes([replace(first, **changed)], folder)
         with refused(f"apps/svr_{name}", tmp=tmp_path, shards=toy_shards):
             scenes_with_images(folder, toy_shards, "test")
-
-
-def test_known_models_are_counted(toy_shards):
-    images, _ = images_of_split(toy_shards, "train", 0)
-    share = known_model_share(images, toy_shards, "train")
-    assert share in (1.0, None)
-    share = known_model_share(images_of_split(toy_shards, "test", 0)[0], toy_shards, "test")
-    assert share is None or np.isfinite(share)
