@@ -11,7 +11,6 @@ from data_prep.cli import add_commands
 from sceneprior import __version__
 from sceneprior.apps.cli import (
     evaluating,
-    experiments,
     generating,
     reconstruction,
     sharing,
@@ -33,7 +32,7 @@ for command in (
     reconstruction.reconstruct, reconstruction.eval_svr,
     sharing.pack, sharing.priors, sharing.export,
     evaluating.evaluate, evaluating.eval_fid,
-    experiments.compare, experiments.demo, viewing.view,
+    training.compare, training.demo, viewing.view,
 ):  # fmt: skip
     app.command()(command)
 

@@ -6,18 +6,13 @@ from typing import Annotated, Any
 import typer
 
 from sceneprior.apps.cli.options import (
-    CeilingOption,
     DistributionOption,
-    FloorOption,
     InceptionOption,
-    OpeningsOption,
-    RequestOption,
     ScenesOption,
     SeedOption,
-    WantOption,
     checked_target,
-    request_of,
     result_file,
+    with_request,
 )
 from sceneprior.core.errors import InputError
 
@@ -91,6 +86,7 @@ def eval_fid(
     _print(found, target)
 
 
+@with_request
 def evaluate(
     run: SomeRunOption = None,
     scenes: ScenesOption = None,
@@ -130,11 +126,7 @@ def evaluate(
     resamples: ResamplesOption = 200,
     out: OutOption = None,
     distribution: DistributionOption = None,
-    floor: FloorOption = None,
-    openings: OpeningsOption = None,
-    ceiling: CeilingOption = None,
-    want: WantOption = None,
-    request: RequestOption = None,
+    asked: Any = None,
 ) -> None:
     """Measure whether rooms can be used, and compare them with real rooms, as eval-fid does.
 
@@ -147,7 +139,6 @@ def evaluate(
     from sceneprior.evaluation.use import UseOptions
 
     _check_source(run, scenes, distribution)
-    asked: dict[str, Any] = request_of(floor, openings, ceiling, want, request)
     options = EvalOptions(seed, inception, alexnet, split, boxes, resamples)
     use = UseOptions(settle, only_use, standing)
     if run is not None:

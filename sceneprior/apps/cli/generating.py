@@ -5,30 +5,25 @@ start.
 """
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from sceneprior.apps.cli.messages import rooms_in_words
 from sceneprior.apps.cli.options import (
     MODELS_HELP,
     OWN_HELP,
     CacheOption,
     CadOption,
-    CeilingOption,
     CountOption,
     DistributionOption,
-    FloorOption,
-    OpeningsOption,
     OverwriteOption,
-    RequestOption,
     RunOption,
     SeedOption,
     ShellOption,
-    WantOption,
     checked_shell,
     note_unmet,
-    request_of,
+    rooms_in_words,
+    with_request,
 )
 from sceneprior.core.files import check_free
 
@@ -38,17 +33,14 @@ EMPTY_TOLD = 5
 """Maximum number of empty rooms that `synthesize` names."""
 
 
+@with_request
 def synthesize(
     run: RunOption,
     out: Annotated[Path, typer.Option(help="Folder for the scenes.")],
     count: CountOption = 16,
     seed: SeedOption = 0,
     distribution: DistributionOption = None,
-    floor: FloorOption = None,
-    openings: OpeningsOption = None,
-    ceiling: CeilingOption = None,
-    want: WantOption = None,
-    request: RequestOption = None,
+    asked: Any = None,
     cad: CadOption = False,
     html: Annotated[
         bool, typer.Option("--html", help="Also write rooms.html, one page of 3D models.")
@@ -66,7 +58,6 @@ def synthesize(
     from sceneprior.evaluation.page import write_rooms_page
 
     drawn = checked_shell(shell or "none")
-    asked = request_of(floor, openings, ceiling, want, request)
     prior = load(run)
     scenes = prior.sample(count, seed, distribution, **asked, cad=cad)
     write_scenes(scenes, out, drawn)
@@ -109,6 +100,7 @@ def interpolate(
     typer.echo(f"Wrote {steps} rooms, strip.png and animation.gif to {out}")
 
 
+@with_request
 def complete(
     run: RunOption,
     given: Annotated[Path, typer.Option(help="Scene JSON of the given objects.")],
@@ -119,11 +111,7 @@ def complete(
         str | None,
         typer.Option(help="Classes of the objects to add: double_bed,nightstand (samplers only)."),
     ] = None,
-    floor: FloorOption = None,
-    openings: OpeningsOption = None,
-    ceiling: CeilingOption = None,
-    want: WantOption = None,
-    request: RequestOption = None,
+    asked: Any = None,
     cad: CadOption = False,
     distribution: DistributionOption = None,
     shell: ShellOption = None,
@@ -142,7 +130,6 @@ def complete(
     from sceneprior.render.scene_files import load_scene
 
     drawn = checked_shell(shell or "none")
-    asked = request_of(floor, openings, ceiling, want, request)
     scene = load_scene(given, with_materials=True)
     scene = replace(scene, objects=(*scene.objects, *asked.pop("objects", ())))
     wanted = None if classes is None else [label.strip() for label in classes.split(",")]

@@ -1,12 +1,13 @@
-"""Options that several commands share."""
+"""Options that several commands share, and what these make of their values."""
 
-from collections.abc import Sequence
+import functools
+import inspect
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sceneprior.apps.cli.messages import rooms_in_words
 from sceneprior.core.errors import InputError
 from sceneprior.core.repeatable import LARGEST_SEED
 
@@ -34,30 +35,6 @@ SeedOption = Annotated[
     typer.Option(
         min=0, max=LARGEST_SEED, help="Seed of all random choices: the same seed, the same result."
     ),
-]
-FloorOption = Annotated[
-    str | None,
-    typer.Option(
-        help="Floor of the rooms: 4x3 (metres along x and z), corners '0,0 5,0 5,3 2,3 2,5 0,5', "
-        "or a file with a floor (FILE, or FILE:ROOM of a 3D-FRONT house); samplers only."
-    ),
-]
-OpeningsOption = Annotated[
-    str | None,
-    typer.Option(help="Doors and windows: door,window@north,door@south:1.5 (samplers only)."),
-]
-CeilingOption = Annotated[
-    float | None, typer.Option(help="Height of the ceiling in metres (samplers only).")
-]
-WantOption = Annotated[
-    str | None,
-    typer.Option(
-        help="Wishes: 'a double bed and two nightstands beside it', or numbers of objects: "
-        "'nightstand: 2, desk: 0' (samplers only)."
-    ),
-]
-RequestOption = Annotated[
-    Path | None, typer.Option(help="JSON of a request: floor, openings, wishes (samplers only).")
 ]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")]
 ShellOption = Annotated[
@@ -90,17 +67,62 @@ CacheOption = Annotated[
 
 
 def request_of(
-    floor: str | None,
-    openings: str | None,
-    ceiling: float | None,
-    want: str | None,
-    request: Path | None,
+    floor: Annotated[
+        str | None,
+        typer.Option(
+            help="Floor of the rooms: 4x3 (metres along x and z), corners '0,0 5,0 5,3 2,3 2,5 "
+            "0,5', or a file with a floor (FILE, or FILE:ROOM of a 3D-FRONT house); samplers only."
+        ),
+    ] = None,
+    openings: Annotated[
+        str | None,
+        typer.Option(help="Doors and windows: door,window@north,door@south:1.5 (samplers only)."),
+    ] = None,
+    ceiling: Annotated[
+        float | None, typer.Option(help="Height of the ceiling in metres (samplers only).")
+    ] = None,
+    want: Annotated[
+        str | None,
+        typer.Option(
+            help="Wishes: 'a double bed and two nightstands beside it', or numbers of objects: "
+            "'nightstand: 2, desk: 0' (samplers only)."
+        ),
+    ] = None,
+    request: Annotated[
+        Path | None,
+        typer.Option(help="JSON of a request: floor, openings, wishes (samplers only)."),
+    ] = None,
 ) -> dict[str, Any]:
-    """Build the arguments of `Prior.sample` from the options of a request and its file."""
+    """The arguments of `Prior.sample` from the options of a request and its file."""
+    asked = {"floor": floor, "openings": openings, "ceiling_m": ceiling, "want": want}
+    if request is None and not any(value is not None for value in asked.values()):
+        return {}
     from sceneprior.apps.requests import load_request, merged
 
-    asked = {"floor": floor, "openings": openings, "ceiling_m": ceiling, "want": want}
     return merged(asked, {} if request is None else load_request(request))
+
+
+def with_request(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command the options of a request in place of its parameter `asked`, which it is
+    called with: the arguments that `request_of` makes of them."""
+    shared = inspect.signature(request_of).parameters
+    own = inspect.signature(command, eval_str=True)
+    parameters = list(own.parameters.values())
+    at = list(own.parameters).index("asked")
+    parameters[at : at + 1] = shared.values()
+
+    @functools.wraps(command)
+    def with_options(**values: Any) -> None:
+        asked = request_of(**{name: values.pop(name) for name in shared})
+        command(**values, asked=asked)
+
+    with_options.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
+    return with_options
+
+
+def rooms_in_words(count: int) -> str:
+    """The number of rooms: `1 room`, `2 rooms`."""
+    return "1 room" if count == 1 else f"{count} rooms"
 
 
 def note_unmet(scenes: Sequence["Scene"]) -> None:
@@ -128,16 +150,6 @@ def result_file(run: str, out: Path | None, name: str) -> Path:
     return checked_target(folder / name)
 
 
-def checked_shell(shell: str) -> "ShellName":
-    """Check the value of `--shell`."""
-    from sceneprior.core.shell import SHELLS
-
-    for known in SHELLS:
-        if shell == known:
-            return known
-    raise InputError(f"--shell {shell} is not known; choose from {', '.join(SHELLS)}.")
-
-
 def checked_target(target: Path) -> Path:
     """Check, before the work begins, that a file can be written; return its path."""
     from sceneprior.core.files import check_writable
@@ -146,3 +158,13 @@ def checked_target(target: Path) -> Path:
         raise InputError(f"{target} is a folder; name a file with --out.")
     check_writable(target)
     return target
+
+
+def checked_shell(shell: str) -> "ShellName":
+    """Check the value of `--shell`."""
+    from sceneprior.core.shell import SHELLS
+
+    for known in SHELLS:
+        if shell == known:
+            return known
+    raise InputError(f"--shell {shell} is not known; choose from {', '.join(SHELLS)}.")

@@ -5,7 +5,6 @@ from typing import Annotated
 
 import typer
 
-from sceneprior.apps.cli.messages import rooms_in_words
 from sceneprior.apps.cli.options import (
     MODELS_HELP,
     OverwriteOption,
@@ -13,6 +12,7 @@ from sceneprior.apps.cli.options import (
     SeedOption,
     checked_target,
     result_file,
+    rooms_in_words,
 )
 
 FitOption = Annotated[

@@ -5,8 +5,12 @@ from typing import Annotated
 
 import typer
 
-from sceneprior.apps.cli.messages import rooms_in_words
-from sceneprior.apps.cli.options import OverwriteOption, ShellOption, checked_shell
+from sceneprior.apps.cli.options import (
+    OverwriteOption,
+    ShellOption,
+    checked_shell,
+    rooms_in_words,
+)
 from sceneprior.core.errors import InputError
 
 

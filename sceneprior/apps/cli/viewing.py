@@ -2,7 +2,7 @@
 
 import threading
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -10,17 +10,13 @@ from sceneprior.apps.cli.options import (
     MODELS_HELP,
     OWN_HELP,
     CacheOption,
-    CeilingOption,
-    FloorOption,
-    OpeningsOption,
-    RequestOption,
     ShellOption,
-    WantOption,
     checked_shell,
-    request_of,
+    with_request,
 )
 
 
+@with_request
 def view(
     where: Annotated[
         str, typer.Argument(metavar="RUN_OR_SCENES", help="A run, or a folder of scenes.")
@@ -29,11 +25,7 @@ def view(
         Path | None,
         typer.Option(help=f"Models that the page may show: {MODELS_HELP} {OWN_HELP}"),
     ] = None,
-    floor: FloorOption = None,
-    openings: OpeningsOption = None,
-    ceiling: CeilingOption = None,
-    want: WantOption = None,
-    request: RequestOption = None,
+    asked: Any = None,
     shell: ShellOption = None,
     host: Annotated[
         str, typer.Option(help="Address to serve on; 0.0.0.0 opens the page to your network.")
@@ -51,7 +43,6 @@ def view(
 
     check_can_serve(host, port)  # before seconds are spent on loading
     drawn = checked_shell(shell or "walls")
-    asked = request_of(floor, openings, ceiling, want, request)
     import torch
 
     from sceneprior.apps.api import load
