@@ -15,7 +15,6 @@ from sceneprior.apps.cli import (
     reconstruction,
     sharing,
     training,
-    viewing,
 )
 
 app = typer.Typer(
@@ -32,7 +31,7 @@ for command in (
     reconstruction.reconstruct, reconstruction.eval_svr,
     sharing.pack, sharing.priors, sharing.export,
     evaluating.evaluate, evaluating.eval_fid,
-    training.compare, training.demo, viewing.view,
+    training.compare, training.demo, generating.view,
 ):  # fmt: skip
     app.command()(command)
 

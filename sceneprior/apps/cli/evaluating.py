@@ -1,20 +1,16 @@
 """The commands evaluate and eval-fid; they import their dependencies when called."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sceneprior.apps.cli.options import (
-    DistributionOption,
-    InceptionOption,
-    ScenesOption,
-    SeedOption,
-    checked_target,
-    result_file,
-    with_request,
-)
+from sceneprior.apps.cli import options
 from sceneprior.core.errors import InputError
+
+if TYPE_CHECKING:
+    from sceneprior.evaluation.synthesis import EvalOptions
+    from sceneprior.evaluation.use import UseOptions
 
 GENERATED, MEASURED = 1000, 200
 
@@ -40,15 +36,15 @@ OutOption = Annotated[
 
 def eval_fid(
     run: SomeRunOption = None,
-    scenes: ScenesOption = None,
+    scenes: options.Scenes = None,
     count: Annotated[
         int | None,
         typer.Option(
             "-n", "--count", min=2, help=f"Rooms (default: {GENERATED} of a run, or all scenes)."
         ),
     ] = None,
-    seed: SeedOption = 0,
-    inception: InceptionOption = None,
+    seed: options.Seed = 0,
+    inception: options.Inception = None,
     alexnet: AlexnetOption = None,
     shards: Annotated[
         Path | None, typer.Option(help="Shards with the test rooms (default: those of the run).")
@@ -57,7 +53,7 @@ def eval_fid(
     boxes: BoxesOption = False,
     resamples: ResamplesOption = 200,
     out: OutOption = None,
-    distribution: DistributionOption = None,
+    distribution: options.Distribution = None,
 ) -> None:
     """Compare generated rooms with test rooms, by the distributions of docs/evaluation.md.
 
@@ -66,37 +62,23 @@ def eval_fid(
     values cannot be compared with FID or KID. The protocol is written with the scores. `evaluate`
     also measures whether rooms can be used.
     """
-    from sceneprior.apps.experiments.evaluate import evaluate_folder, evaluate_run
     from sceneprior.evaluation.synthesis import EvalOptions
 
-    _check_source(run, scenes, distribution)
-    options = EvalOptions(seed, inception, alexnet, split, boxes, resamples)
-    if run is not None:
-        target = result_file(run, out, "scores.json")
-        found = evaluate_run(run, count or GENERATED, options, target, shards, distribution)
-    elif scenes is not None and shards is not None:
-        target = checked_target(out or scenes / "scores.json")
-        found = evaluate_folder(scenes, count, options, target, shards)
-    elif scenes is not None:
-        raise InputError("--scenes needs --shards: the folder with the test rooms.")
-    else:
-        raise InputError(
-            "There is nothing to evaluate; give --run RUN, or --scenes DIR with --shards SHARDS."
-        )
-    _print(found, target)
+    protocol = EvalOptions(seed, inception, alexnet, split, boxes, resamples)
+    _score(run, scenes, count, protocol, shards, out, distribution)
 
 
-@with_request
+@options.with_request
 def evaluate(
     run: SomeRunOption = None,
-    scenes: ScenesOption = None,
+    scenes: options.Scenes = None,
     count: Annotated[
         int | None,
         typer.Option(
             "-n", "--count", min=1, help=f"Rooms (default: {MEASURED} of a run, or all scenes)."
         ),
     ] = None,
-    seed: SeedOption = 0,
+    seed: options.Seed = 0,
     shards: Annotated[
         Path | None,
         typer.Option(
@@ -119,13 +101,13 @@ def evaluate(
             "(divides meshes, a minute or two each), or none."
         ),
     ] = "solids",
-    inception: InceptionOption = None,
+    inception: options.Inception = None,
     alexnet: AlexnetOption = None,
     split: SplitOption = "test",
     boxes: BoxesOption = False,
     resamples: ResamplesOption = 200,
     out: OutOption = None,
-    distribution: DistributionOption = None,
+    distribution: options.Distribution = None,
     asked: Any = None,
 ) -> None:
     """Measure whether rooms can be used, and compare them with real rooms, as eval-fid does.
@@ -134,40 +116,53 @@ def evaluate(
     ReSpace), and stability in MuJoCo. With shards, real, shuffled and random rooms are measured for
     comparison, and all metrics of eval-fid are computed; without shards, only the metrics of use.
     """
-    from sceneprior.apps.experiments.evaluate import evaluate_folder, evaluate_run
     from sceneprior.evaluation.synthesis import EvalOptions
     from sceneprior.evaluation.use import UseOptions
 
-    _check_source(run, scenes, distribution)
-    options = EvalOptions(seed, inception, alexnet, split, boxes, resamples)
+    protocol = EvalOptions(seed, inception, alexnet, split, boxes, resamples)
     use = UseOptions(settle, only_use, standing)
-    if run is not None:
-        target = result_file(run, out, "scores.json")
-        found = evaluate_run(
-            run, count or MEASURED, options, target, shards, distribution, use, asked
-        )
-    elif scenes is not None:
-        if asked:
-            raise InputError("Requests belong to --run; scenes are evaluated as they are.")
-        target = checked_target(out or scenes / "scores.json")
-        found = evaluate_folder(scenes, count, options, target, shards, use)
-    else:
-        raise InputError("There is nothing to evaluate; give --run RUN, or --scenes DIR.")
-    _print(found, target)
+    _score(run, scenes, count, protocol, shards, out, distribution, use, asked)
 
 
-def _check_source(run: str | None, scenes: Path | None, distribution: str | None) -> None:
+def _score(
+    run: str | None,
+    scenes: Path | None,
+    count: int | None,
+    protocol: "EvalOptions",
+    shards: Path | None,
+    out: Path | None,
+    distribution: str | None,
+    use: "UseOptions | None" = None,
+    asked: dict[str, Any] | None = None,
+) -> None:
+    """Score the rooms of a run, or a folder of scenes; with `use`, by metrics of use as well."""
+    from sceneprior.apps.experiments.evaluate import evaluate_folder, evaluate_run
+    from sceneprior.evaluation.score_table import print_scores
+
     if run is not None and scenes is not None:
         raise InputError(
             "Both --run and --scenes were given; give --run to evaluate rooms that a run "
             "generates, or --scenes to evaluate existing scenes."
         )
-    if scenes is not None and distribution is not None:
-        raise InputError("--distribution belongs to --run; scenes are evaluated as they are.")
-
-
-def _print(found: dict[str, Any], target: Path) -> None:
-    from sceneprior.evaluation.score_table import print_scores
-
+    if run is not None:
+        target, count = (
+            options.result_file(run, out, "scores.json"),
+            count or (MEASURED if use else GENERATED),
+        )
+        found = evaluate_run(run, count, protocol, target, shards, distribution, use, asked)
+    elif scenes is not None:
+        if distribution is not None:
+            raise InputError("--distribution belongs to --run; scenes are evaluated as they are.")
+        if asked:
+            raise InputError("Requests belong to --run; scenes are evaluated as they are.")
+        if use is None and shards is None:
+            raise InputError("--scenes needs --shards: the folder with the test rooms.")
+        target = options.checked_target(out or scenes / "scores.json")
+        found = evaluate_folder(scenes, count, protocol, target, shards, use)
+    else:
+        with_shards = "" if use else " with --shards SHARDS"
+        raise InputError(
+            f"There is nothing to evaluate; give --run RUN, or --scenes DIR{with_shards}."
+        )
     print_scores(found)
     typer.echo(f"Wrote {target}")

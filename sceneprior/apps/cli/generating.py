@@ -1,30 +1,16 @@
-"""Commands that generate or complete rooms, or retrieve models; dependencies load when called.
+"""Commands that generate, complete or view rooms, or retrieve models; imports wait for the call.
 
 Pictures are rendered by the z-buffer, because without a GPU, GL is slower and takes a second to
 start.
 """
 
+import threading
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from sceneprior.apps.cli.options import (
-    MODELS_HELP,
-    OWN_HELP,
-    CacheOption,
-    CadOption,
-    CountOption,
-    DistributionOption,
-    OverwriteOption,
-    RunOption,
-    SeedOption,
-    ShellOption,
-    checked_shell,
-    note_unmet,
-    rooms_in_words,
-    with_request,
-)
+from sceneprior.apps.cli import options
 from sceneprior.core.files import check_free
 
 BROKEN_TOLD = 5
@@ -33,20 +19,20 @@ EMPTY_TOLD = 5
 """Maximum number of empty rooms that `synthesize` names."""
 
 
-@with_request
+@options.with_request
 def synthesize(
-    run: RunOption,
+    run: options.Run,
     out: Annotated[Path, typer.Option(help="Folder for the scenes.")],
-    count: CountOption = 16,
-    seed: SeedOption = 0,
-    distribution: DistributionOption = None,
+    count: options.Count = 16,
+    seed: options.Seed = 0,
+    distribution: options.Distribution = None,
     asked: Any = None,
-    cad: CadOption = False,
+    cad: options.Cad = False,
     html: Annotated[
         bool, typer.Option("--html", help="Also write rooms.html, one page of 3D models.")
     ] = False,
-    shell: ShellOption = None,
-    overwrite: OverwriteOption = False,
+    shell: options.Shell = None,
+    overwrite: options.Overwrite = False,
 ) -> None:
     """Generate rooms: JSON, GLB and a top-down PNG each, and latents if the method has them.
 
@@ -57,16 +43,16 @@ def synthesize(
     from sceneprior.apps.rooms import PAGE_FILE, write_scenes
     from sceneprior.evaluation.page import write_rooms_page
 
-    drawn = checked_shell(shell or "none")
+    drawn = options.checked_shell(shell or "none")
     prior = load(run)
     scenes = prior.sample(count, seed, distribution, **asked, cad=cad)
     write_scenes(scenes, out, drawn)
-    note_unmet(scenes)
+    options.note_unmet(scenes)
     origin = distribution or prior.distribution
     if html:
         told = f"run {Path(run).resolve().name} · seed {seed} · from: {origin}"
         write_rooms_page(out / PAGE_FILE, scenes, title="New rooms", subtitle=told, shell=drawn)
-    typer.echo(f"Wrote {rooms_in_words(count)} to {out} (from: {origin})")
+    typer.echo(f"Wrote {options.rooms_in_words(count)} to {out} (from: {origin})")
     if empty := [scene.name for scene in scenes if not scene.objects]:
         more = f" and {len(empty) - EMPTY_TOLD} more" * (len(empty) > EMPTY_TOLD)
         typer.echo(
@@ -80,12 +66,12 @@ _END_HELP = "a training room's id, seed:7, or a latent in a file: scenes/latents
 
 
 def interpolate(
-    run: RunOption,
+    run: options.Run,
     start: Annotated[str, typer.Option("--from", help=f"First room: {_END_HELP}")],
     end: Annotated[str, typer.Option("--to", help="Last room, named like the first one.")],
     out: Annotated[Path, typer.Option(help="Folder for the rooms and pictures.")],
     steps: Annotated[int, typer.Option(min=2, max=1000, help="Rooms, both ends included.")] = 9,
-    overwrite: OverwriteOption = False,
+    overwrite: options.Overwrite = False,
 ) -> None:
     """Interpolate between two rooms on the sphere: rooms, a strip and an animation."""
     check_free(out, overwrite)  # before imports that take seconds
@@ -100,22 +86,22 @@ def interpolate(
     typer.echo(f"Wrote {steps} rooms, strip.png and animation.gif to {out}")
 
 
-@with_request
+@options.with_request
 def complete(
-    run: RunOption,
+    run: options.Run,
     given: Annotated[Path, typer.Option(help="Scene JSON of the given objects.")],
     out: Annotated[Path, typer.Option(help="Folder for the completed rooms.")],
-    count: CountOption = 4,
-    seed: SeedOption = 0,
+    count: options.Count = 4,
+    seed: options.Seed = 0,
     classes: Annotated[
         str | None,
         typer.Option(help="Classes of the objects to add: double_bed,nightstand (samplers only)."),
     ] = None,
     asked: Any = None,
-    cad: CadOption = False,
-    distribution: DistributionOption = None,
-    shell: ShellOption = None,
-    overwrite: OverwriteOption = False,
+    cad: options.Cad = False,
+    distribution: options.Distribution = None,
+    shell: options.Shell = None,
+    overwrite: options.Overwrite = False,
 ) -> None:
     """Complete a room, given some objects and optionally the floor.
 
@@ -129,17 +115,17 @@ def complete(
     from sceneprior.apps.rooms import write_scenes
     from sceneprior.render.scene_files import load_scene
 
-    drawn = checked_shell(shell or "none")
+    drawn = options.checked_shell(shell or "none")
     scene = load_scene(given, with_materials=True)
     scene = replace(scene, objects=(*scene.objects, *asked.pop("objects", ())))
     wanted = None if classes is None else [label.strip() for label in classes.split(",")]
     prior = load(run)
     scenes = prior.complete(scene, count, seed, distribution, wanted, **asked, cad=cad)
     write_scenes(scenes, out, drawn)
-    note_unmet(scenes)
+    options.note_unmet(scenes)
     given_objects = f"{len(scene.objects)} given object{'s' * (len(scene.objects) != 1)}"
     how = "drawn by the sampler" if scenes[0].latent is None else "decoded from fitted latents"
-    typer.echo(f"Wrote {rooms_in_words(count)} around {given_objects}, {how}, to {out}")
+    typer.echo(f"Wrote {options.rooms_in_words(count)} around {given_objects}, {how}, to {out}")
     for room in scenes:
         if lacking := room.extra.get("no_place"):
             typer.echo(f"Note: {room.name} has no place for {', '.join(lacking)}.", err=True)
@@ -149,10 +135,10 @@ def retrieve(
     scenes: Annotated[Path, typer.Option(help="Folder of scene JSONs, with their GLBs.")],
     out: Annotated[Path, typer.Option(help="Folder for the scenes with CAD models.")],
     models: Annotated[
-        Path | None, typer.Option(help=f"CAD models: {MODELS_HELP} {OWN_HELP}")
+        Path | None, typer.Option(help=f"CAD models: {options.MODELS_HELP} {options.OWN_HELP}")
     ] = None,
-    cache: CacheOption = None,
-    overwrite: OverwriteOption = False,
+    cache: options.Cache = None,
+    overwrite: options.Overwrite = False,
 ) -> None:
     """Replace every object by the most similar CAD model of its class."""
     check_free(out, overwrite)  # before imports that take seconds
@@ -189,4 +175,65 @@ def retrieve(
         typer.echo(f"{len(broken)} models are broken; see retrieval.json")
     for reason in [*broken.values()][:BROKEN_TOLD]:
         typer.echo(f"Note: {reason}.", err=True)
-    typer.echo(f"Wrote {rooms_in_words(len(made))} to {out}")
+    typer.echo(f"Wrote {options.rooms_in_words(len(made))} to {out}")
+
+
+@options.with_request
+def view(
+    where: Annotated[
+        str, typer.Argument(metavar="RUN_OR_SCENES", help="A run, or a folder of scenes.")
+    ],
+    models: Annotated[
+        Path | None,
+        typer.Option(
+            help=f"Models that the page may show: {options.MODELS_HELP} {options.OWN_HELP}"
+        ),
+    ] = None,
+    asked: Any = None,
+    shell: options.Shell = None,
+    host: Annotated[
+        str, typer.Option(help="Address to serve on; 0.0.0.0 opens the page to your network.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port to serve on.")] = 8080,
+    cache: options.Cache = None,
+) -> None:
+    """View rooms in the browser, request new ones, and explore the latent space of a run.
+
+    Ctrl-C ends it. The first room fulfils the request given by the options, and is shown with walls
+    unless --shell says otherwise.
+    """
+    from sceneprior.apps.viewer.server import check_can_serve, serving
+    from sceneprior.core.errors import InputError
+
+    check_can_serve(host, port)  # before seconds are spent on loading
+    drawn = options.checked_shell(shell or "walls")
+    import torch
+
+    from sceneprior.apps.api import load
+    from sceneprior.apps.requests import with_floor_of_file
+    from sceneprior.apps.retrieval.cad_models import open_models
+    from sceneprior.apps.viewer.explorer import Explorer, Folder
+    from sceneprior.apps.viewer.panel import open_page
+    from sceneprior.render.scene_files import load_scene_folder
+
+    # One room at a time is too little work for several threads.
+    torch.set_num_threads(1)
+    folder, stop = Path(where), threading.Event()
+    is_folder = folder.is_dir() and not (folder / "config.yaml").is_file()
+    try:
+        if asked and is_folder:
+            raise InputError(
+                f"{where} holds scenes, which are shown as they are; a request needs a prior."
+            )
+        source = Folder(load_scene_folder(folder)) if is_folder else Explorer(load(where))
+        bank = None if models is None else open_models(models, source.label_set, cache)
+        with serving(host, port) as server:
+            open_page(server, source, folder.name, bank, with_floor_of_file(asked), drawn)
+            typer.echo(f"Open http://localhost:{port} in a browser. Ctrl-C ends it.")
+            if isinstance(source, Explorer):
+                threading.Thread(target=source.find_meshes, args=(stop,)).start()
+            stop.wait()
+    except KeyboardInterrupt:
+        typer.echo("\nStopped: the page is closed.")
+    finally:
+        stop.set()

@@ -15,52 +15,50 @@ if TYPE_CHECKING:
     from sceneprior.core.scene import Scene
     from sceneprior.core.shell import ShellName
 
-RunOption = Annotated[
+Run = Annotated[
     str,
     typer.Option(
         help="The trained prior: the folder of a run that `fit` made, a packed prior, the name of "
         "a shipped one (see `priors`), or hf://OWNER/NAME."
     ),
 ]
-DistributionOption = Annotated[
+Distribution = Annotated[
     str | None,
     typer.Option(
         help="Distribution that new rooms are drawn from: sampler, paper, or kernel, which gives "
         "near copies of training rooms (default: the config's)."
     ),
 ]
-CountOption = Annotated[int, typer.Option("-n", "--count", min=1, help="Number of rooms to make.")]
-SeedOption = Annotated[
+Count = Annotated[int, typer.Option("-n", "--count", min=1, help="Number of rooms to make.")]
+Seed = Annotated[
     int,
     typer.Option(
         min=0, max=LARGEST_SEED, help="Seed of all random choices: the same seed, the same result."
     ),
 ]
-OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")]
-ShellOption = Annotated[
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")]
+Shell = Annotated[
     str | None,
     typer.Option(
         help="Parts of the room itself to write: walls (with floor and ceiling), floor, or none."
     ),
 ]
-InceptionOption = Annotated[
+Inception = Annotated[
     Path | None, typer.Option(help="The file inception-2015-12-05.pt (TorchScript), for FID.")
 ]
-AcceleratorOption = Annotated[
-    str, typer.Option(help="Device to train on: cpu, gpu or auto (Lightning).")
-]
-ScenesOption = Annotated[
+Accelerator = Annotated[str, typer.Option(help="Device to train on: cpu, gpu or auto (Lightning).")]
+Scenes = Annotated[
     Path | None, typer.Option(help="A folder of scene JSONs of any method, in place of --run.")
 ]
 MODELS_HELP = (
     "a 3D-FUTURE-model folder, shards, or a folder with GLBs or OBJs in sub-folders by class."
 )
 OWN_HELP = "Default: the package's own furniture."
-CadOption = Annotated[
+Cad = Annotated[
     bool,
     typer.Option("--cad", help="Replace decoded meshes by models of the package's own furniture."),
 ]
-CacheOption = Annotated[
+Cache = Annotated[
     Path | None,
     typer.Option(help="Folder that keeps the CAD models' points (default: ~/.cache/sceneprior)."),
 ]

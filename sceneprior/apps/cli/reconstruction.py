@@ -5,15 +5,7 @@ from typing import Annotated
 
 import typer
 
-from sceneprior.apps.cli.options import (
-    MODELS_HELP,
-    OverwriteOption,
-    RunOption,
-    SeedOption,
-    checked_target,
-    result_file,
-    rooms_in_words,
-)
+from sceneprior.apps.cli import options
 
 FitOption = Annotated[
     str, typer.Option(help="Fit: objects (one by one), or paper (one latent, in 1,000 steps).")
@@ -25,7 +17,7 @@ RestartsOption = Annotated[
 
 
 def reconstruct(
-    run: RunOption,
+    run: options.Run,
     out: Annotated[Path, typer.Option(help="Folder for the rooms.")],
     shards: Annotated[Path | None, typer.Option(help="Shards with the images.")] = None,
     room: Annotated[str | None, typer.Option(help="Id of a room of the shards.")] = None,
@@ -56,8 +48,8 @@ def reconstruct(
     ] = None,
     fit: FitOption = "objects",
     restarts: RestartsOption = 1,
-    seed: SeedOption = 0,
-    overwrite: OverwriteOption = False,
+    seed: options.Seed = 0,
+    overwrite: options.Overwrite = False,
 ) -> None:
     """Reconstruct rooms from the instance masks of single images: JSON, GLB and pictures."""
     from sceneprior.apps.api import load
@@ -114,7 +106,7 @@ def reconstruct(
     write_reconstructions(found, out)
     if mask is not None:
         write_page(found[0], out)
-    typer.echo(f"Wrote {rooms_in_words(len(found))} to {out}")
+    typer.echo(f"Wrote {options.rooms_in_words(len(found))} to {out}")
 
 
 def eval_svr(
@@ -133,9 +125,9 @@ def eval_svr(
     restarts: RestartsOption = 1,
     models: Annotated[
         Path | None,
-        typer.Option(help=f"CAD models to put in place of the fits, too: {MODELS_HELP}"),
+        typer.Option(help=f"CAD models to put in place of the fits, too: {options.MODELS_HELP}"),
     ] = None,
-    seed: SeedOption = 0,
+    seed: options.Seed = 0,
 ) -> None:
     """Evaluate single-view reconstruction, with training rooms as baselines."""
     from sceneprior.apps.reconstruction.reconstruct import FitOptions
@@ -150,9 +142,9 @@ def eval_svr(
 
     protocol = SvrProtocol(shards, split, seed, views)
     if run is not None and scenes is None:
-        options = FitOptions(fit, restarts)
-        target = result_file(run, out, "svr.json")
-        found = evaluate_run(run, protocol, options, limit, models)
+        chosen = FitOptions(fit, restarts)
+        target = options.result_file(run, out, "svr.json")
+        found = evaluate_run(run, protocol, chosen, limit, models)
     elif scenes is not None and run is None:
         given = (views, limit, fit, restarts, models)
         if given != (1, None, "objects", 1, None):
@@ -160,7 +152,7 @@ def eval_svr(
                 "--views, --limit, --fit, --restarts and --models belong to --run; scenes are "
                 "evaluated as they are."
             )
-        target = checked_target(out or scenes / "svr.json")
+        target = options.checked_target(out or scenes / "svr.json")
         found = evaluate_scenes(scenes, protocol)
     else:
         raise InputError("Say what to evaluate: either --run, or --scenes with reconstructions.")

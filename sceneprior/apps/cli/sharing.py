@@ -5,12 +5,7 @@ from typing import Annotated
 
 import typer
 
-from sceneprior.apps.cli.options import (
-    OverwriteOption,
-    ShellOption,
-    checked_shell,
-    rooms_in_words,
-)
+from sceneprior.apps.cli import options
 from sceneprior.core.errors import InputError
 
 
@@ -30,7 +25,7 @@ def pack(
     half: Annotated[
         bool, typer.Option("--half", help="Store large tensors in half precision.")
     ] = False,
-    overwrite: OverwriteOption = False,
+    overwrite: options.Overwrite = False,
 ) -> None:
     """Write a trained run to one file for sharing: weights, settings, a card; no pickle."""
     from sceneprior.apps.config import load_any_run, run_config
@@ -122,8 +117,8 @@ def export(
         str | None,
         typer.Option(help="Extents in box lists: half, as ATISS writes them (default), or full."),
     ] = None,
-    shell: ShellOption = None,
-    overwrite: OverwriteOption = False,
+    shell: options.Shell = None,
+    overwrite: options.Overwrite = False,
 ) -> None:
     """Export scenes to another format, or convert box lists, such as ATISS's, to scenes.
 
@@ -146,7 +141,7 @@ def export(
         if (label_set, classes, sizes) != (None, None, None):
             raise InputError("--label-set, --classes and --sizes apply only with --to scenes.")
         rooms = load_scene_folder(source, with_materials=True)
-        asked = None if shell is None else checked_shell(shell)
+        asked = None if shell is None else options.checked_shell(shell)
         for note in export_scenes(rooms, to, out, asked):
             typer.echo(f"Note: {note}", err=True)
-    typer.echo(f"Wrote {rooms_in_words(len(rooms))} to {out}")
+    typer.echo(f"Wrote {options.rooms_in_words(len(rooms))} to {out}")

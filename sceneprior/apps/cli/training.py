@@ -7,13 +7,7 @@ from typing import Annotated
 
 import typer
 
-from sceneprior.apps.cli.options import (
-    AcceleratorOption,
-    InceptionOption,
-    ScenesOption,
-    SeedOption,
-    checked_target,
-)
+from sceneprior.apps.cli import options
 from sceneprior.core.errors import InputError
 
 
@@ -30,7 +24,7 @@ def fit(
         list[str] | None, typer.Option(help="Logger: csv, tensorboard or wandb; repeatable.")
     ] = None,
     devices: Annotated[str, typer.Option(help="Number or list of devices (Lightning).")] = "auto",
-    accelerator: AcceleratorOption = "auto",
+    accelerator: options.Accelerator = "auto",
     precision: Annotated[str, typer.Option(help="32-true or bf16-mixed (Lightning).")] = "32-true",
 ) -> None:
     """Train the stages of a run, one after the other."""
@@ -40,9 +34,9 @@ def fit(
     folder = run or Path("runs") / Path(config).stem
     from sceneprior.training.fit import fit as run_fit
 
-    options = {"devices": devices, "accelerator": accelerator, "precision": precision}
+    chosen = {"devices": devices, "accelerator": accelerator, "precision": precision}
     try:
-        run_fit(settings, folder, resume, tuple(logger or ("csv", "tensorboard")), options)
+        run_fit(settings, folder, resume, tuple(logger or ("csv", "tensorboard")), chosen)
     except KeyboardInterrupt:
         saved = folder / "config.yaml"
         said = "Stopped before training began; run the same command again."
@@ -56,7 +50,7 @@ def fit(
 
 def report(
     run: Annotated[Path | None, typer.Option(help="Folder of a run that `fit` made.")] = None,
-    scenes: ScenesOption = None,
+    scenes: options.Scenes = None,
     shards: Annotated[
         Path | None, typer.Option(help="Shards that --scenes were evaluated on.")
     ] = None,
@@ -66,7 +60,7 @@ def report(
     out: Annotated[
         Path | None, typer.Option(help="HTML file (default: report.html in RUN or SCENES).")
     ] = None,
-    seed: SeedOption = 0,
+    seed: options.Seed = 0,
     command: Annotated[
         list[str] | None, typer.Option(help="Command to list on the page; repeatable.")
     ] = None,
@@ -78,12 +72,12 @@ def report(
     if run is not None and (scenes, shards) == (None, None):
         target = out or run / "report.html"
         if run.is_dir():
-            checked_target(target)
+            options.checked_target(target)
         report_run(run, scores, target, seed, commands)
     elif scenes is not None and shards is not None and run is None:
         if seed != 0:
             raise InputError("--seed belongs to --run; scenes are shown as they are.")
-        target = checked_target(out or scenes / "report.html")
+        target = options.checked_target(out or scenes / "report.html")
         report_folder(scenes, shards, scores, target, commands)
     else:
         raise InputError(
@@ -110,8 +104,8 @@ def compare(
     methods: Annotated[str | None, typer.Option(help="Methods, such as lifted,lstm.")] = None,
     rooms: Annotated[str | None, typer.Option(help="Kinds of rooms, such as bedroom.")] = None,
     seeds: Annotated[str | None, typer.Option(help="Seeds, such as 0,1 (default: all).")] = None,
-    inception: InceptionOption = None,
-    accelerator: AcceleratorOption = "auto",
+    inception: options.Inception = None,
+    accelerator: options.Accelerator = "auto",
 ) -> None:
     """Train and evaluate methods on the same rooms, and tabulate them; run again to continue."""
     from sceneprior.apps.experiments.compare import compare as run_comparison
