@@ -22,10 +22,9 @@ import shapely
 from scipy import ndimage
 from tracks import NOISES, moved, observed, rooms
 
-from data_prep.front.houses import house_files
+from data_prep.front.houses import house_files, read_house
 from data_prep.front.models import ModelBank
 from data_prep.front.recipe import load_recipe
-from data_prep.front.rooms import read_house
 from sceneprior.core.found_floor import Door, Wall, find_floor
 from sceneprior.core.shards import RoomViews
 

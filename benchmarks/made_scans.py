@@ -27,10 +27,9 @@ from scipy.spatial.transform import Rotation
 
 from data_prep.engine.plan import read_splits
 from data_prep.front.furnished import Room
-from data_prep.front.houses import house_files
+from data_prep.front.houses import house_files, read_house
 from data_prep.front.models import ModelBank
 from data_prep.front.recipe import Recipe, load_recipe
-from data_prep.front.rooms import read_house
 from data_prep.readers.frames import Y_UP
 from data_prep.readers.nyu40 import LIKE_NYU40, NYU40
 from data_prep.readers.scannet.labels import Labels, read_labels

@@ -25,14 +25,11 @@ from data_prep.engine.source import (
     sentence_of,
 )
 from data_prep.engine.workers import Run
-from data_prep.front.drawing import prepare_room
-from data_prep.front.filters import broken_rule, outside_floor, unknown_categories
-from data_prep.front.furnished import Room
-from data_prep.front.houses import House, house_files, parse_house
+from data_prep.front.drawing import prepare_room, rgb_files
+from data_prep.front.furnished import Room, broken_rule, outside_floor, unknown_categories
+from data_prep.front.houses import House, house_files, parse_house, read_house
 from data_prep.front.models import ModelBank
 from data_prep.front.recipe import Recipe
-from data_prep.front.rgb import rgb_files
-from data_prep.front.rooms import read_house
 from data_prep.front.viewpoints import view_counts
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import file_stamp
@@ -56,7 +53,7 @@ class FrontSource:
     seed: int = 0
     only: str | None = None
     rgb: bool = False
-    """True also renders shaded pictures, `rgb/<room>/<view>.png` (rgb.py); no effect on shards."""
+    """True also renders shaded pictures, `rgb/<room>/<view>.png`; no effect on shards."""
 
     @property
     def label_set(self) -> str:
@@ -131,9 +128,8 @@ class FrontSource:
         house = _parsed(path, file_stamp(path))
         read = read_house(house, self.bank, self.recipe, lambda its_id, _: its_id == task.room_id)
         if not read.rooms:
-            reasons = [why for _, why in read.failures] + [why for *_, why in read.filtered]
-            why = reasons[0] if reasons else "it is no longer in the house file"
-            return Line(task.room_id, task.house, "failed", reason=why)
+            why = [line.reason for line in read.left_out] or ["it is no longer in the house file"]
+            return Line(task.room_id, task.house, "failed", reason=why[0])
         room = read.rooms[0]
         # The rules are checked again with meshes: unreadable models may leave too little furniture.
         broken = broken_rule(room, self.recipe)
@@ -222,9 +218,8 @@ def _survey_houses(
         except Exception as error:
             left_out.append(Line(house, house, "failed", reason=sentence_of(error)))
             continue
-        left_out += [Line(room_id, house, "failed", reason=why) for room_id, why in read.failures]
-        for room_id, rule, why in read.filtered:
-            left_out.append(Line(room_id, house, "filtered", rule, why))
+        # Unusable rooms come first.
+        left_out += sorted(read.left_out, key=lambda line: line.status == "filtered")
         good = []
         for room in read.rooms:
             broken = broken_rule(room, recipe)

@@ -73,13 +73,13 @@ def _place_bed(room: Furnisher, groups: list[str]) -> Piece | None:
     """
     wall, models = room.long_wall(), room.catalog[groups[0]]
     if groups[0] == "double_bed" or any("nightstands" in group for group in groups):
-        where = wall.length * room.rng.uniform(0.42, 0.58)
+        where = wall.length_m * room.rng.uniform(0.42, 0.58)
         return room.against_wall(models, 0.5, [wall], where=where, tries=8)
     return room.against_wall(models, 0.4, [wall], corner=0.75, tries=8)
 
 
 def _bedside_lamps(room: Furnisher, group: str) -> bool:
-    nightstands = [piece for piece in room.plan.pieces if piece.model.name == "nightstand"]
+    nightstands = [piece for piece in room.layout.pieces if piece.model.name == "nightstand"]
     small = sorted(room.catalog["pendant_lamp"], key=lambda model: model.size_m[0])[:4]
     twin = [small[room.rng.integers(len(small))]]
     return all([room.hang(twin, (n.x, n.z), n.top + 0.3, 0.0) for n in nightstands[:2]])
@@ -101,7 +101,7 @@ def _bench(room: Furnisher, group: str) -> object:
 
 def _armchair(room: Furnisher, group: str) -> Piece | None:
     """Place an armchair near a wall, facing the middle of the room, perhaps with a small table."""
-    middle = (room.plan.width / 2, room.plan.depth / 2)
+    middle = (room.layout.width / 2, room.layout.depth / 2)
     chair = room.standing_free(room.catalog["armchair"], ANGLED, middle)
     _, _, companion = group.partition(" and ")
     if chair is None or not companion:

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data_prep.homes.layout import Piece, Plan
+from data_prep.homes.layout import Layout, Piece, empty_room, is_liveable, yaw_at
 from data_prep.homes.placement import Furnisher
-from data_prep.homes.rooms import empty_room, is_liveable
 from sceneprior.furniture.catalog import Catalog
 
 Offers = dict[str, tuple[int, float]]
@@ -48,7 +47,9 @@ class RoomType:
     """Classes that must be reachable on foot from the door."""
 
 
-def furnish(room_type: RoomType, catalog: Catalog, rng: np.random.Generator, share: float) -> Plan:
+def furnish(
+    room_type: RoomType, catalog: Catalog, rng: np.random.Generator, share: float
+) -> Layout:
     """Make a furnished, walkable room; `share` is the quantile of its number of pieces."""
     count = count_at(room_type.counts, share)
     first = room_type.draw_first(rng)
@@ -61,15 +62,15 @@ def furnish(room_type: RoomType, catalog: Catalog, rng: np.random.Generator, sha
             groups.insert(0, first)
         growth = 1 + 0.02 * min(attempt, room_type.growing_tries)
         area = (base + per_piece * count) * rng.uniform(0.85, 1.2) * growth
-        plan = empty_room(rng, area, room_type.sides_m, room_type.l_shaped_chance)
-        room = Furnisher(plan, catalog, rng)
+        layout = empty_room(rng, area, room_type.sides_m, room_type.l_shaped_chance)
+        room = Furnisher(layout, catalog, rng)
         anchor = room_type.place_first(room, groups)
         if anchor is None:
             continue
         room.anchor = anchor
         arranged = all(room_type.rules[group.split(" ")[0]](room, group) for group in groups[1:])
-        if arranged and is_liveable(plan, room_type.reach):
-            return plan
+        if arranged and is_liveable(layout, room_type.reach):
+            return layout
     raise RuntimeError(
         f"No {room_type.name} could hold these {count} pieces in 400 tries: {groups}."
     )
@@ -151,12 +152,11 @@ def opposite_the_anchor(room: Furnisher, group: str) -> Piece | None:
     anchor = room.anchor
     facing = [
         wall
-        for wall in room.plan.walls
-        if np.cos(wall.yaw_rad - anchor.yaw_rad) < -0.9 and wall.length > 1.5
+        for wall in room.layout.walls
+        if np.cos(yaw_at(wall) - anchor.yaw_rad) < -0.9 and wall.length_m > 1.5
     ]
     if not facing:
         return None
-    wall = max(facing, key=lambda wall: wall.length)
-    along_x, along_z = wall.along
-    where = abs(along_x) * abs(anchor.x - wall.x) + abs(along_z) * abs(anchor.z - wall.z)
+    wall = max(facing, key=lambda wall: wall.length_m)
+    where = float(np.abs(wall.direction) @ np.abs((anchor.x, anchor.z) - wall.start_m))
     return room.against_wall(room.catalog[group], walls=[wall], where=where, tries=15)

@@ -1,4 +1,4 @@
-"""Plan of a room: its walls, its pieces, and the test whether another piece fits.
+"""Layout of a room: empty rooms, their pieces, and the tests that a piece fits and one can walk.
 
 Floor coordinates are x and z in metres; the room's outer rectangle starts at (0, 0). A positive
 yaw rotates a piece's front from +z towards +x. The axis-aligned bounding boxes of two pieces may
@@ -8,7 +8,9 @@ not overlap: stricter than necessary, but it keeps the 3D ground truth free of o
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import shapely
 
+from sceneprior.core.outline import Wall, walls_of
 from sceneprior.furniture.catalog import Model
 from sceneprior.furniture.solids import Vector
 
@@ -17,6 +19,15 @@ Rect = tuple[float, float, float, float]
 
 CEILING_GAP_M = 0.03
 """Minimum gap between a tall piece and the ceiling."""
+
+DOOR_M = 0.9
+"""Width of a door, and depth of the clear floor in front of it."""
+
+FREE_SHARE = 0.45
+"""Minimum share of the floor without furniture."""
+
+SHOULDERS_M = 0.2
+"""Half of the minimum width of a passage."""
 
 
 @dataclass(frozen=True)
@@ -70,21 +81,16 @@ class Piece:
         return min(xa, xb), min(za, zb), max(xa, xb), max(za, zb)
 
 
-@dataclass(frozen=True)
-class Wall:
-    """A straight wall: its start, direction, length, and the yaw it faces."""
+def point_by(wall: Wall, along_m: float, off_m: float) -> tuple[float, float]:
+    """Point on the floor `along_m` metres from the wall's start, `off_m` metres from the wall."""
+    x, z = wall.start_m + along_m * wall.direction + off_m * wall.inward
+    return float(x), float(z)
 
-    x: float
-    z: float
-    along: tuple[int, int]
-    length: float
-    yaw_rad: float
-    """Yaw of a piece whose back is to this wall."""
 
-    def point(self, along: float, off: float) -> tuple[float, float]:
-        """Point on the floor `along` metres from the wall's start, `off` metres from the wall."""
-        run_x, run_z = self.along
-        return self.x + run_x * along - run_z * off, self.z + run_z * along + run_x * off
+def yaw_at(wall: Wall) -> float:
+    """Yaw of a piece whose back is to the wall."""
+    x, z = wall.inward + 0.0  # turns -0.0 into 0.0, whose angle has the other sign
+    return float(np.arctan2(x, z))
 
 
 def overlaps(a: Rect, b: Rect, gap: float = 0.0) -> bool:
@@ -94,7 +100,7 @@ def overlaps(a: Rect, b: Rect, gap: float = 0.0) -> bool:
 
 
 @dataclass
-class Plan:
+class Layout:
     """A room being furnished."""
 
     width: float
@@ -105,6 +111,8 @@ class Plan:
     pieces: list[Piece] = field(default_factory=list)
     kept_clear: list[Rect] = field(default_factory=list)
     """Floor that stays empty: first at the door, then in front of pieces with a clearance."""
+    door: tuple[Wall, float] = field(init=False)
+    """Wall of the door, and the middle of the door along it."""
 
     @property
     def area(self) -> float:
@@ -138,14 +146,7 @@ class Plan:
     @property
     def walls(self) -> list[Wall]:
         """Walls, one per side of the outline."""
-        corners = self.outline
-        walls = []
-        for (x0, z0), (x1, z1) in zip(corners, corners[1:] + corners[:1], strict=True):
-            length = abs(x1 - x0) + abs(z1 - z0)
-            along = (int(np.sign(x1 - x0)), int(np.sign(z1 - z0)))
-            # The interior is on the wall's left: the inward normal is (-along_z, along_x).
-            walls.append(Wall(x0, z0, along, length, float(np.arctan2(-along[1], along[0]))))
-        return walls
+        return walls_of(np.array(self.outline))
 
     def fits(self, piece: Piece, crowding: bool = False) -> bool:
         """Test whether the piece fits; with `crowding`, only the door's floor must stay clear."""
@@ -181,3 +182,62 @@ class Plan:
         if x0 < gap or z0 < gap or x1 > self.width - gap or z1 > self.depth - gap:
             return False
         return self.notch is None or not overlaps(rect, self.notch, gap)
+
+
+def empty_room(
+    rng: np.random.Generator, area_m2: float, sides_m: tuple[float, float], l_shaped_chance: float
+) -> Layout:
+    """Sample a rectangular or L-shaped room of about this area, with a door.
+
+    The sides of its bounding rectangle lie within `sides_m`.
+    """
+    aspect = rng.uniform(1.0, 1.55)
+    long = float(np.clip(np.sqrt(area_m2 * aspect), *sides_m))
+    short = float(np.clip(area_m2 / long, *sides_m))
+    width, depth = (long, short) if rng.random() < 0.5 else (short, long)
+    width, depth = round(width, 2), round(depth, 2)
+    notch = None
+    if rng.random() < l_shaped_chance and short > sides_m[0] + 0.4:
+        notch_x = round(width * rng.uniform(0.15, 0.35), 2)
+        notch_z = round(depth * rng.uniform(0.15, 0.35), 2)
+        x0 = 0.0 if rng.random() < 0.5 else round(width - notch_x, 2)
+        z0 = 0.0 if rng.random() < 0.5 else round(depth - notch_z, 2)
+        notch = (x0, z0, round(x0 + notch_x, 2), round(z0 + notch_z, 2))
+    layout = Layout(width, depth, round(float(rng.uniform(2.6, 3.0)), 2), notch)
+    _add_door(layout, rng)
+    return layout
+
+
+def _add_door(layout: Layout, rng: np.random.Generator) -> None:
+    """Sample a door near one end of a wall, and keep the floor in front of it clear."""
+    walls = [wall for wall in layout.walls if wall.length_m > 1.8]
+    wall = walls[rng.integers(len(walls))]
+    half, middle = DOOR_M / 2, 0.1 + DOOR_M / 2
+    if rng.random() < 0.5:
+        middle = wall.length_m - middle
+    layout.door = wall, middle
+    x, z = point_by(wall, middle, half)
+    layout.kept_clear.append((x - half, z - half, x + half, z + half))
+
+
+def is_liveable(layout: Layout, reach: tuple[str, ...]) -> bool:
+    """Test whether enough floor is free and each class in `reach` is reachable from the door."""
+    standing = [piece for piece in layout.pieces if piece.y == 0]
+    covered = sum(piece.size_m[0] * piece.size_m[2] for piece in standing)
+    if covered > (1 - FREE_SHARE) * layout.area:
+        return False
+    floor = shapely.Polygon(layout.outline).buffer(-SHOULDERS_M, join_style="mitre")
+    shapes = [shapely.box(*piece.rect) for piece in standing]
+    walkable = floor - shapely.union_all(shapes).buffer(SHOULDERS_M, join_style="mitre")
+    door = layout.kept_clear[0]
+    entrance = shapely.Point((door[0] + door[2]) / 2, (door[1] + door[3]) / 2)
+    areas = list(getattr(walkable, "geoms", [walkable]))
+    here = next((area for area in areas if area.contains(entrance)), None)
+    if here is None:
+        return False
+    at_hand = here.buffer(2.5 * SHOULDERS_M)
+    return all(
+        at_hand.intersects(shape)
+        for piece, shape in zip(standing, shapes, strict=True)
+        if piece.model.name in reach
+    )

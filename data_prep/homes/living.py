@@ -13,7 +13,7 @@ from data_prep.homes.furnish import (
     opposite_the_anchor,
     table_and_seat,
 )
-from data_prep.homes.layout import Piece, Plan
+from data_prep.homes.layout import Layout, Piece, yaw_at
 from data_prep.homes.placement import Furnisher
 
 COUNTS = {4: 40, 5: 65, 6: 90, 7: 110, 8: 120, 9: 120, 10: 110, 11: 95, 12: 78, 13: 60, 14: 44,
@@ -57,7 +57,7 @@ def _place_sofa(room: Furnisher, groups: list[str]) -> Piece | None:
     wall, share = room.long_wall(), room.rng.uniform(0.35, 0.65)
     if any(group.startswith("dining") for group in groups):  # leaves one end to the table
         share = float(room.rng.choice([0.0, 1.0]) + room.rng.uniform(-0.3, 0.3))
-    where = wall.length * share
+    where = wall.length_m * share
     return room.against_wall(room.catalog["sofa"], 0.5, [wall], where=where, tries=10)
 
 
@@ -68,7 +68,7 @@ def _coffee_table(room: Furnisher, group: str) -> Piece | None:
 
 def _dining(room: Furnisher, group: str) -> bool:
     """Place "dining 6", a table with six chairs, preferably not in front of the sofa."""
-    plan, rng = room.plan, room.rng
+    layout, rng = room.layout, room.rng
     count = int(group.split(" ")[1])
     tables = room.models("table", above=1.5 if count > 4 else 1.0)
     chairs = [model for model in room.models("chair", below=0.68) if model.size_m[2] < 0.72]
@@ -77,22 +77,22 @@ def _dining(room: Furnisher, group: str) -> bool:
         yaw = float(rng.integers(4)) * np.pi / 2
         half_x, half_z = table.half_extent(yaw)
         around = chair.model.size_m[2] + 0.1
-        if 2 * (half_x + around) > plan.width or 2 * (half_z + around) > plan.depth:
+        if 2 * (half_x + around) > layout.width or 2 * (half_z + around) > layout.depth:
             continue
-        x = rng.uniform(half_x + around, plan.width - half_x - around)
-        z = rng.uniform(half_z + around, plan.depth - half_z - around)
+        x = rng.uniform(half_x + around, layout.width - half_x - around)
+        z = rng.uniform(half_z + around, layout.depth - half_z - around)
         table = table.at(x, z, yaw)
         if attempt < 30 and _is_before(room.anchor, table):
             continue
         places = _chair_places(table, chair.size_m[0], count)
-        if len(places) < count or not plan.fits(table):
+        if len(places) < count or not layout.fits(table):
             continue
         ring = [_chair_at(room, table, chair, *place) for place in places]
-        if not all(plan.fits(piece) for piece in ring):
+        if not all(layout.fits(piece) for piece in ring):
             continue
-        trial = Plan(plan.width, plan.depth, plan.height, plan.notch, [table])
+        trial = Layout(layout.width, layout.depth, layout.height, layout.notch, [table])
         if all([trial.add(piece) for piece in ring]):
-            plan.pieces += [table, *ring]
+            layout.pieces += [table, *ring]
             return True
     return False
 
@@ -135,7 +135,7 @@ def _side_tables(room: Furnisher, group: str) -> object:
 
 def _armchair(room: Furnisher, group: str) -> Piece | None:
     """Place an armchair at a side of the coffee table, facing it, or near a wall."""
-    tables = [piece for piece in room.plan.pieces if piece.model.name == "coffee_table"]
+    tables = [piece for piece in room.layout.pieces if piece.model.name == "coffee_table"]
     chairs, sofa = room.catalog["armchair"], room.anchor
     for side in room.rng.permutation([-1, 1]) if tables else ():
         table = tables[0]
@@ -151,16 +151,16 @@ def _armchair(room: Furnisher, group: str) -> Piece | None:
 def _second_sofa(room: Furnisher, group: str) -> Piece | None:
     """Place a short second sofa at a wall perpendicular to the first's."""
     yaw = room.anchor.yaw_rad
-    across = [wall for wall in room.plan.walls if abs(np.cos(wall.yaw_rad - yaw)) < 0.5]
+    across = [wall for wall in room.layout.walls if abs(np.cos(yaw_at(wall) - yaw)) < 0.5]
     return room.against_wall(room.models("sofa", below=2.2), 0.4, across)
 
 
 def _lamp(room: Furnisher, group: str) -> Piece | None:
     """Hang a lamp: first over the dining table, then over the coffee table, then mid-room."""
-    plan, rng = room.plan, room.rng
-    hanging = [piece for piece in plan.pieces if piece.y > 0]
-    large = [p for p in plan.pieces if p.model.name == "table" and p.size_m[0] > 0.95]
-    tables = large + [piece for piece in plan.pieces if piece.model.name == "coffee_table"]
+    layout, rng = room.layout, room.rng
+    hanging = [piece for piece in layout.pieces if piece.y > 0]
+    large = [p for p in layout.pieces if p.model.name == "table" and p.size_m[0] > 0.95]
+    tables = large + [piece for piece in layout.pieces if piece.model.name == "coffee_table"]
     if len(hanging) < len(tables) and rng.random() < 0.8:
         table = tables[len(hanging)]
         pendants, above, lowest = room.catalog["pendant_lamp"], (table.x, table.z), table.top + 0.6
@@ -168,7 +168,10 @@ def _lamp(room: Furnisher, group: str) -> Piece | None:
             return lamp
     x, z = room.lamp_position()
     if hanging:
-        x, z = x + rng.uniform(-0.25, 0.25) * plan.width, z + rng.uniform(-0.25, 0.25) * plan.depth
+        x, z = (
+            x + rng.uniform(-0.25, 0.25) * layout.width,
+            z + rng.uniform(-0.25, 0.25) * layout.depth,
+        )
     kind = "ceiling_lamp" if rng.random() < 0.55 else "pendant_lamp"
     return room.hang(room.catalog[kind], (x, z), 1.7, LAMP_ANGLED)
 

@@ -11,9 +11,15 @@ from rich.progress import track
 
 from data_prep.homes.bedroom import BEDROOM, BEDS
 from data_prep.homes.furnish import furnish
-from data_prep.homes.layout import Plan
+from data_prep.homes.layout import Layout
 from data_prep.homes.living import LIVING_ROOM
-from data_prep.homes.write import PlacedRoom, house_json, model_record, write_json, write_model
+from data_prep.homes.write import (
+    PlacedRoom,
+    house_json,
+    model_record,
+    write_compact_json,
+    write_model,
+)
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import only_writer
 from sceneprior.furniture.catalog import Catalog, make_catalog
@@ -83,7 +89,9 @@ def _write(folder: Path, rooms: int, room_type: str, seed: int) -> None:
     console = Console(stderr=True)
     for model in track(models, "Building furniture", console=console, transient=True):
         write_model(folder / "3D-FUTURE-model", model)
-    write_json(folder / "3D-FUTURE-model" / "model_info.json", [model_record(m) for m in models])
+    write_compact_json(
+        folder / "3D-FUTURE-model" / "model_info.json", [model_record(m) for m in models]
+    )
     contents: dict[str, list[str]] = {}
     houses = _houses(rooms, room_type, seed)
     for house, numbers in enumerate(
@@ -91,9 +99,9 @@ def _write(folder: Path, rooms: int, room_type: str, seed: int) -> None:
     ):
         uid = str(uuid.uuid5(uuid.NAMESPACE_OID, f"sceneprior homes {seed} {room_type} {house}"))
         placed = _house(catalog, room_type, seed, house, numbers)
-        write_json(folder / "3D-FRONT" / f"{uid}.json", house_json(uid, placed))
+        write_compact_json(folder / "3D-FRONT" / f"{uid}.json", house_json(uid, placed))
         for room in placed:
-            names = sorted(piece.model.name for piece in room.plan.pieces)
+            names = sorted(piece.model.name for piece in room.layout.pieces)
             contents[f"{uid}_{room.instanceid}"] = names
     _write_split(folder / "splits" / f"{room_type}.csv", contents, seed)
 
@@ -128,18 +136,18 @@ def _house(
     for number in numbers:
         share = (start + number * _GOLDEN) % 1.0
         own = _seeded(seed, room_type, "room", number)
-        plan = furnish(ROOM_TYPES[room_type], catalog, own, share)
-        kind = _kind(plan, {room.kind for room in placed})
-        placed.append(PlacedRoom(plan, kind, f"{kind}-{1000 + number}", x, z))
-        x = round(x + plan.width + float(rng.uniform(0.3, 1.0)), 2)
+        layout = furnish(ROOM_TYPES[room_type], catalog, own, share)
+        kind = _kind(layout, {room.kind for room in placed})
+        placed.append(PlacedRoom(layout, kind, f"{kind}-{1000 + number}", x, z))
+        x = round(x + layout.width + float(rng.uniform(0.3, 1.0)), 2)
     return placed
 
 
-def _kind(plan: Plan, taken: set[str]) -> str:
+def _kind(layout: Layout, taken: set[str]) -> str:
     """The room's type in 3D-FRONT; a house has at most one master bedroom."""
-    names = {piece.model.name for piece in plan.pieces}
+    names = {piece.model.name for piece in layout.pieces}
     if not names & set(BEDS):
-        dining = any(p.model.name == "table" and p.model.size_m[0] > 1.0 for p in plan.pieces)
+        dining = any(p.model.name == "table" and p.model.size_m[0] > 1.0 for p in layout.pieces)
         return "LivingDiningRoom" if dining else "LivingRoom"
     if "kids_bed" in names:
         return "Bedroom"

@@ -6,7 +6,8 @@ from math import inf
 
 import numpy as np
 
-from data_prep.homes.layout import Piece, Plan, Wall
+from data_prep.homes.layout import Layout, Piece, point_by, yaw_at
+from sceneprior.core.outline import Wall
 from sceneprior.furniture.catalog import Catalog, Model
 from sceneprior.furniture.solids import Vector
 
@@ -19,13 +20,13 @@ def random_scale(rng: np.random.Generator) -> Vector:
 
 @dataclass
 class Furnisher:
-    """Places furniture from a catalogue in one plan.
+    """Places furniture from a catalogue in one layout.
 
     Each placing method tries several models, scales and positions, and returns the piece that it
-    added to the plan, or None.
+    added to the layout, or None.
     """
 
-    plan: Plan
+    layout: Layout
     catalog: Catalog
     rng: np.random.Generator
     anchor: Piece = field(init=False)
@@ -47,7 +48,7 @@ class Furnisher:
 
     def long_wall(self) -> Wall:
         """Sample one of the four longest walls."""
-        walls = sorted(self.plan.walls, key=lambda wall: -wall.length)[:4]
+        walls = sorted(self.layout.walls, key=lambda wall: -wall.length_m)[:4]
         return walls[self.rng.integers(len(walls))]
 
     def _try(
@@ -60,7 +61,7 @@ class Furnisher:
     ) -> Piece | None:
         for _ in range(tries):
             piece = propose(self.pick(models))
-            if piece and self.plan.add(piece, clearance, crowding):
+            if piece and self.layout.add(piece, clearance, crowding):
                 return piece
         return None
 
@@ -79,13 +80,13 @@ class Furnisher:
         the wall. `where` is the desired position of the piece's centre along the wall in metres;
         the sampled position varies with a standard deviation of 0.15.
         """
-        choice = self.plan.walls if walls is None else walls
-        lengths = np.array([wall.length for wall in choice])
+        choice = self.layout.walls if walls is None else walls
+        lengths = np.array([wall.length_m for wall in choice])
 
         def propose(piece: Piece) -> Piece | None:
             wall = choice[self.rng.choice(len(choice), p=lengths / lengths.sum())]
             width, _, depth = piece.size_m
-            slack = wall.length - width
+            slack = wall.length_m - width
             if slack < 0.04:
                 return None
             start = self.rng.uniform(0.01, slack - 0.01)
@@ -94,7 +95,7 @@ class Furnisher:
             elif self.rng.random() < corner:
                 start = self.rng.choice([0.02, slack - 0.02])
             off = depth / 2 + self.rng.uniform(0.006, 0.025)
-            return piece.at(*wall.point(start + width / 2, off), wall.yaw_rad)
+            return piece.at(*point_by(wall, start + width / 2, off), yaw_at(wall))
 
         return self._try(models, tries, propose, clearance)
 
@@ -127,7 +128,7 @@ class Furnisher:
             off = anchor.size_m[0] / 2 + width / 2 + self.rng.uniform(0.02, 0.12)
             place = anchor.ahead((depth - anchor.size_m[2]) / 2, side * off)
             placed = piece.at(*place, anchor.yaw_rad)
-            if self.plan.add(placed, crowding=True):
+            if self.layout.add(placed, crowding=True):
                 return placed
         return None
 
@@ -145,7 +146,7 @@ class Furnisher:
         """Place a light piece near a wall, facing a point or along one of the room's axes."""
 
         def propose(piece: Piece) -> Piece:
-            width, depth = self.plan.width, self.plan.depth
+            width, depth = self.layout.width, self.layout.depth
             half = max(piece.model.size_m[0], piece.model.size_m[2]) / 2
             along = self.rng.uniform(half, width - half), self.rng.uniform(half, depth - half)
             edge = self.rng.integers(4)
@@ -171,7 +172,7 @@ class Furnisher:
         """Hang a lamp from the ceiling above `place`, no part of it below `lowest`."""
 
         def propose(piece: Piece) -> Piece | None:
-            bottom = self.plan.height - piece.size_m[1]
+            bottom = self.layout.height - piece.size_m[1]
             if bottom < lowest:
                 return None
             yaw = yaw_rad + self.random_turn(angled)
@@ -182,8 +183,8 @@ class Furnisher:
 
     def lamp_position(self) -> tuple[float, float]:
         """Centre of the largest rectangle of the floor."""
-        width, depth = self.plan.width, self.plan.depth
-        range_x, range_z = self.plan.beside_notch
+        width, depth = self.layout.width, self.layout.depth
+        range_x, range_z = self.layout.beside_notch
         if (range_x[1] - range_x[0]) * depth > (range_z[1] - range_z[0]) * width:
             return sum(range_x) / 2, depth / 2
         return width / 2, sum(range_z) / 2

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from data_prep.homes.layout import Piece, Plan, Rect
+from data_prep.homes.layout import DOOR_M, Layout, Piece, Rect, point_by
 from sceneprior.furniture.catalog import Model
 
 WALL_M = 0.12
@@ -24,7 +24,7 @@ _IDENTITY = {"pos": [0, 0, 0], "rot": [0, 0, 0, 1], "scale": [1, 1, 1]}
 class PlacedRoom:
     """A furnished room, its names in the data set, and the position of its corner in the house."""
 
-    plan: Plan
+    layout: Layout
     kind: str
     instanceid: str
     x: float
@@ -61,12 +61,12 @@ def house_json(uid: str, rooms: list[PlacedRoom]) -> dict[str, Any]:
     for room in rooms:
         children = []
         corner = np.array([room.x, 0.0, room.z])
-        for kind, triangles in shell(room.plan):
+        for kind, triangles in shell(room.layout):
             number += 1
             mesh = _mesh(uid, number, kind, triangles + corner)
             meshes.append(mesh)
             children.append({"ref": mesh["uid"], "instanceid": f"mesh/{number}", **_IDENTITY})
-        for piece in room.plan.pieces:
+        for piece in room.layout.pieces:
             number += 1
             entry = catalog.setdefault(piece.model.jid, _furniture(uid, len(catalog), piece.model))
             children.append(_placement(entry["uid"], number, piece, room))
@@ -74,7 +74,7 @@ def house_json(uid: str, rooms: list[PlacedRoom]) -> dict[str, Any]:
             {
                 "type": room.kind,
                 "instanceid": room.instanceid,
-                "size": round(room.plan.area, 2),
+                "size": round(room.layout.area, 2),
                 **_IDENTITY,
                 "children": children,
                 "empty": 0,
@@ -98,45 +98,38 @@ def house_json(uid: str, rooms: list[PlacedRoom]) -> dict[str, Any]:
     }
 
 
-def shell(plan: Plan) -> list[tuple[str, np.ndarray]]:
+def shell(layout: Layout) -> list[tuple[str, np.ndarray]]:
     """Floor, ceiling, walls and door in the room's frame, each as (type, (triangles, 3, 3)).
 
     Floor, ceiling, inner walls and the door face the room; outer walls face away from it.
     """
-    tiles = np.concatenate([_tile(rect) for rect in _rectangles(plan)])
-    ceiling = tiles[:, ::-1] + np.array([0.0, plan.height, 0.0])
-    corners = np.array(plan.outline)
-    outside = _offset(corners, WALL_M)
-    after = np.roll(corners, -1, axis=0), np.roll(outside, -1, axis=0)
-    inner = [_wall(*ends, plan.height) for ends in zip(corners, after[0], strict=True)]
-    outer = [_wall(*ends, plan.height) for ends in zip(after[1], outside, strict=True)]
-    walls = [("WallInner", part) for part in inner] + [("WallOuter", part) for part in outer]
-    door = _wall(*_door(plan), _DOOR_HEIGHT_M)
-    return [("Floor", tiles), ("Ceiling", ceiling), *walls, ("Door", door)]
+    tiles = np.concatenate([_tile(rect) for rect in _rectangles(layout)])
+    ceiling = tiles[:, ::-1] + np.array([0.0, layout.height, 0.0])
+    walls = layout.walls
+    outward = np.array([wall.outward for wall in walls])
+    outside = np.array(layout.outline) + WALL_M * (outward + np.roll(outward, 1, axis=0))
+    ends = zip(np.roll(outside, -1, axis=0), outside, strict=True)
+    inner = [_wall(wall.start_m, wall.end_m, layout.height) for wall in walls]
+    outer = [_wall(*each, layout.height) for each in ends]
+    wall, middle = layout.door
+    door = [
+        np.array(point_by(wall, middle + side * DOOR_M / 2, _BEFORE_WALL_M)) for side in (-1, 1)
+    ]
+    return [
+        ("Floor", tiles),
+        ("Ceiling", ceiling),
+        *(("WallInner", part) for part in inner),
+        *(("WallOuter", part) for part in outer),
+        ("Door", _wall(*door, _DOOR_HEIGHT_M)),
+    ]
 
 
-def _door(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of the door: the side, nearest to a wall, of the clear floor in front of the door."""
-    x0, z0, x1, z1 = plan.kept_clear[0]
-    half_m = np.array([x1 - x0, z1 - z0]) / 2
-    middle, found = np.array([(x0 + x1) / 2, (z0 + z1) / 2]), []
-    for wall in plan.walls:
-        along = np.array(wall.along, dtype=float)
-        inward = np.array([-along[1], along[0]])
-        from_start = middle - (wall.x, wall.z)
-        reaches = 0 < from_start @ along < wall.length
-        off_m = abs(from_start @ inward - half_m @ abs(inward)) if reaches else np.inf
-        base = middle - (half_m @ abs(inward) - _BEFORE_WALL_M) * inward
-        found.append((off_m, base - half_m * along, base + half_m * along))
-    return min(found, key=lambda each: each[0])[1:]
-
-
-def _rectangles(plan: Plan) -> list[Rect]:
+def _rectangles(layout: Layout) -> list[Rect]:
     """Split the floor into rectangles: one, or two if it is L-shaped."""
-    (x0, x1), (z0, z1) = plan.beside_notch
-    if plan.notch is None:
+    (x0, x1), (z0, z1) = layout.beside_notch
+    if layout.notch is None:
         return [(x0, z0, x1, z1)]
-    return [(0.0, z0, plan.width, z1), (x0, plan.notch[1], x1, plan.notch[3])]
+    return [(0.0, z0, layout.width, z1), (x0, layout.notch[1], x1, layout.notch[3])]
 
 
 def _tile(rect: Rect) -> np.ndarray:
@@ -151,14 +144,6 @@ def _wall(start: np.ndarray, end: np.ndarray, height: float) -> np.ndarray:
     (x0, z0), (x1, z1) = start, end
     a, b, c, d = (x0, 0.0, z0), (x1, 0.0, z1), (x1, height, z1), (x0, height, z0)
     return np.array([[a, b, c], [a, c, d]])
-
-
-def _offset(corners: np.ndarray, distance: float) -> np.ndarray:
-    """Move every side of a rectilinear outline outwards."""
-    sides = np.roll(corners, -1, axis=0) - corners
-    sides /= np.linalg.norm(sides, axis=1, keepdims=True)
-    outward = np.stack([sides[:, 1], -sides[:, 0]], axis=1)
-    return corners + distance * (outward + np.roll(outward, 1, axis=0))
 
 
 def _mesh(uid: str, number: int, kind: str, triangles: np.ndarray) -> dict[str, Any]:
@@ -211,6 +196,6 @@ def _rounded(values: np.ndarray) -> list[float]:
     return (np.round(values.reshape(-1), 5) + 0.0).tolist()  # + 0.0 turns -0.0 into 0.0
 
 
-def write_json(path: Path, content: Any) -> None:
+def write_compact_json(path: Path, content: Any) -> None:
     """Write compact JSON; the same content gives the same bytes."""
     path.write_text(json.dumps(content, separators=(",", ":")) + "\n")

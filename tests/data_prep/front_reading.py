@@ -9,9 +9,9 @@ import pytest
 from front_files import FrontFolder
 
 from data_prep.front.furnished import Furniture, Room
+from data_prep.front.houses import HouseRooms, read_house
 from data_prep.front.models import ModelBank
 from data_prep.front.recipe import load_recipe
-from data_prep.front.rooms import HouseRooms, read_house
 from sceneprior.core.scene import Mesh
 
 

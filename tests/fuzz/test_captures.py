@@ -23,10 +23,10 @@ from pycocotools.mask import encode
 from scan_files import make_scan, write_table
 from scipy.spatial.transform import Rotation
 
-from data_prep.front.filters import broken_rule
+from data_prep.front.furnished import broken_rule
+from data_prep.front.houses import read_house
 from data_prep.front.models import ModelBank
 from data_prep.front.recipe import load_recipe
-from data_prep.front.rooms import read_house
 from data_prep.readers.posed.source import PosedSource
 from data_prep.readers.posed.views import PosedSettings, prepare_posed
 from data_prep.readers.scannet.labels import read_labels

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import shapely
 
+from data_prep.front.houses import read_house
 from data_prep.front.models import ModelBank
 from data_prep.front.recipe import load_recipe
-from data_prep.front.rooms import read_house
 from sceneprior.apps.rooms import write_scenes
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Mesh, Scene, SceneObject

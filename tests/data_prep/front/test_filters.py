@@ -7,7 +7,7 @@ from front_reading import read
 
 from data_prep.engine.build import build_shards
 from data_prep.engine.report import report_tables
-from data_prep.front.filters import broken_rule
+from data_prep.front.furnished import broken_rule
 from data_prep.front.recipe import load_recipe
 from sceneprior.core.shards import read_index
 

@@ -8,9 +8,9 @@ from front_files import bedroom, room, surface
 from front_reading import extent, only_room, read, shared_front, signed_volume
 
 from data_prep.front.geometry import floor_of
+from data_prep.front.houses import read_house
 from data_prep.front.models import ModelBank
 from data_prep.front.recipe import load_recipe
-from data_prep.front.rooms import read_house
 
 
 def test_a_plain_room_by_hand(front):

@@ -12,8 +12,8 @@ from front_jobs import digests, front_job, rooms_of
 from PIL import Image
 
 from data_prep.engine.build import build_shards
+from data_prep.front.drawing import shell_of
 from data_prep.front.furnished import Room
-from data_prep.front.rgb import shell_of
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Mesh
 

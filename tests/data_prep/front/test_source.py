@@ -13,9 +13,9 @@ from front_reading import shared_front
 from data_prep.engine.build import build_shards
 from data_prep.engine.source import Survey
 from data_prep.engine.workers import pool
+from data_prep.front.houses import read_house
 from data_prep.front.models import ModelBank
 from data_prep.front.recipe import load_recipe
-from data_prep.front.rooms import read_house
 from data_prep.front.source import FrontSource
 from sceneprior.core.errors import InputError
 from sceneprior.core.shards import read_index

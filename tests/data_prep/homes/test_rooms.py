@@ -12,8 +12,8 @@ from shapely.geometry import Point
 from data_prep.homes.bedroom import BEDROOM
 from data_prep.homes.bedroom import COUNTS as BEDROOM_COUNTS
 from data_prep.homes.furnish import furnish
+from data_prep.homes.layout import FREE_SHARE
 from data_prep.homes.living import COUNTS as LIVING_COUNTS
-from data_prep.homes.rooms import FREE_SHARE
 from sceneprior.furniture.catalog import make_catalog
 
 
