@@ -1,12 +1,13 @@
 """Groups the masks of single frames by object, using only cameras, masks and classes.
 
 Correlation clustering (`clusters.py`) maximises the sum, over pairs of masks in the same cluster,
-of the log-odds that both show the same object (`affinity.py`), measured at the grid cells that both
-views see. Clustering alternates with space carving (Kutulakos and Seitz, "A theory of shape by
+of the log-odds that both show the same object, measured at the grid cells that both views see
+(`carving.py`). Clustering alternates with space carving (Kutulakos and Seitz, "A theory of shape by
 space carving", IJCV 2000), which compares clusters instead of colours: a cell in which views see
-different clusters, or background, is emptied. At the end, masks that share few cells with others
-join the cluster whose visual hull explains them (`leftovers.py`), and masks that are still alone
-are joined by their directions and sizes (`discs.py`).
+different clusters, or background, is emptied. Masks that show several objects are split on the way
+(`mask_split.py`). At the end, masks that share few cells with others join the cluster whose visual
+hull covers them (`cluster_merge.py`), and masks that are still alone are merged by their directions
+and sizes (`singleton_merge.py`).
 """
 
 from typing import NamedTuple
@@ -14,14 +15,20 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from data_prep.tracks.affinity import id_odds, pair_weights
-from data_prep.tracks.clusters import cluster, main_classes
-from data_prep.tracks.discs import discs_of, join_singles
-from data_prep.tracks.explained import explained
-from data_prep.tracks.leftovers import join_leftovers
-from data_prep.tracks.merged import SPECK, Split, split_merged
-from data_prep.tracks.rays import Surface, first_hits, surface, votes_of, widened
-from data_prep.tracks.voxels import Grid, cameras_of, fill
+from data_prep.tracks.carving import (
+    Grid,
+    Surface,
+    cameras_of,
+    fill,
+    first_hits,
+    surface,
+    votes_of,
+    widened,
+)
+from data_prep.tracks.cluster_merge import hull_coverage, merge_clusters
+from data_prep.tracks.clusters import cluster, id_odds, main_classes, pair_weights
+from data_prep.tracks.mask_split import SPECK, Split, split_masks
+from data_prep.tracks.singleton_merge import discs_of, merge_singletons
 
 STEP = 3
 """Step between the rows and columns used, for images whose longer side is 480 pixels; the step is
@@ -118,7 +125,7 @@ def _labels(
         labels = cluster(weights)
         split: Split = []
         if odds is None and number in SPLIT:
-            full, split = split_merged(masks.ids, step, seen, labels, view, cameras, grid)
+            full, split = split_masks(masks.ids, step, seen, labels, view, cameras, grid)
         if split:
             main = main_classes(labels, classes)[[other for _, other in split]]
             masks = FrameMasks(full, np.concatenate([classes, main]))
@@ -128,13 +135,13 @@ def _labels(
         elif number < ROUNDS - 1:
             _carve(grid, seen, labels, number >= STRICT)
     for _ in range(JOINS if odds is None else 0):
-        share = explained(ids, near, labels, cameras, grid)
-        joined = join_leftovers(labels, share, weights, view, classes)
+        share = hull_coverage(ids, near, labels, cameras, grid)
+        joined = merge_clusters(labels, share, weights, view, classes)
         if np.array_equal(joined, labels):
             break
         labels = joined
     if odds is None:
-        labels = join_singles(labels, discs_of(ids, view, cameras), view, classes)
+        labels = merge_singletons(labels, discs_of(ids, view, cameras), view, classes)
     return masks, labels
 
 

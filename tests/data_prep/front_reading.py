@@ -29,7 +29,7 @@ def read(
 def only_room(front: FrontFolder, path: Path, **options: Any) -> Room:
     """The one room of a house in which nothing fails."""
     result = read(front, path, **options)
-    assert not result.failures and not result.filtered and len(result.rooms) == 1, result
+    assert not result.left_out and len(result.rooms) == 1, result
     return result.rooms[0]
 
 
@@ -37,6 +37,34 @@ def extent(piece: Furniture) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper corner of a piece in the room."""
     vertices = piece.mesh.vertices_m
     return vertices.min(axis=0), vertices.max(axis=0)
+
+
+def described(result: HouseRooms) -> dict[str, Any]:
+    """What was read, in numbers and words: for a golden file."""
+    rooms = {
+        room.room_id: {
+            "type": room.type,
+            "floor": [*rounded(room.floor.bounds), *rounded([room.floor.area])],
+            "height": float(room.height_m),
+            "notes": list(room.notes),
+            "without model": [list(pair) for pair in room.without_model],
+            "shell": {name: len(faces) for name, faces in sorted(room.shell.items())},
+            "furniture": [
+                [
+                    piece.model_id, piece.category, piece.label, rounded([piece.yaw_rad]),
+                    *map(rounded, extent(piece)), rounded([signed_volume(piece.mesh)]),
+                ]
+                for piece in room.furniture
+            ],
+        }
+        for room in result.rooms
+    }  # fmt: skip
+    lines = [[line.room_id, line.status, line.rule, line.reason] for line in result.left_out]
+    return {"rooms": rooms, "left out": lines}
+
+
+def rounded(values: Any) -> list[float]:
+    return (np.round(values, 6) + 0.0).tolist()
 
 
 def signed_volume(mesh: Mesh) -> float:

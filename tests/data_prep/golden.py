@@ -29,7 +29,7 @@ def hold(name: str, found: dict[str, Any], slack: float = 0.0, **hidden: object)
     if os.environ.get("TAKE_GOLDENS"):
         known |= found
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(known, indent=1, sort_keys=True, ensure_ascii=False) + "\n")
+        path.write_text(json.dumps(known, indent=1, sort_keys=True) + "\n")
     for key, value in found.items():
         assert key in known, f"{key} is not in {path}"
         _compare(value, known[key], slack, f"{name}, {key}")

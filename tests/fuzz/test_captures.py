@@ -293,7 +293,7 @@ def test_front_house_json(tmp_path):
 
     def read():
         found = read_house(path, bank, recipe)
-        reasons = [why for *_, why in [*found.failures, *found.filtered]]
+        reasons = [line.reason for line in found.left_out]
         for one in found.rooms:
             for rules in (recipe, atiss):
                 reasons += [broken[1]] if (broken := broken_rule(one, rules)) else []

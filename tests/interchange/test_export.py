@@ -99,7 +99,7 @@ def test_3d_front_s_reader_finds_the_rooms_and_their_models(scenes, tmp_path):
     export_scenes(scenes, "threed-front", tmp_path)
     bank, recipe = ModelBank(tmp_path / "3D-FUTURE-model"), load_recipe("bedroom")
     found = read_house(tmp_path / "3D-FRONT" / "first.json", bank, recipe)
-    assert not found.failures and not found.filtered
+    assert not found.left_out
     (room,) = found.rooms
     assert (room.type, room.room_id) == ("Bedroom", "first_Bedroom-0")
     assert room.floor.equals_exact(shapely.Polygon(FLOOR), 1e-6, normalize=True) or np.isclose(

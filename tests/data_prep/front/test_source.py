@@ -7,18 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 from front_files import FrontFolder, bedroom, room
-from front_jobs import SMALL, front_job
 from front_reading import shared_front
+from refusals import refused
 
-from data_prep.engine.build import build_shards
 from data_prep.engine.source import Survey
 from data_prep.engine.workers import pool
 from data_prep.front.houses import read_house
 from data_prep.front.models import ModelBank
 from data_prep.front.recipe import load_recipe
 from data_prep.front.source import FrontSource
-from sceneprior.core.errors import InputError
-from sceneprior.core.shards import read_index
 
 RULES_OFF = ("min_objects=null", "max_objects=null", "max_floor_m=null", "max_height_m=null",
              "required_classes=[]", "scale_range=null")  # fmt: skip
@@ -64,21 +61,13 @@ def test_each_room_type_finds_its_rooms(front, kind, rooms):
     assert [item.rule for item in found.left_out] == (["min_objects"] if kind == "all" else [])
 
 
-def test_rooms_of_every_type_become_one_data_set(front, tmp_path):
+def test_a_type_that_no_room_has_and_a_room_without_its_house(front):
     flat(front)
-    recipe = load_recipe("all", SMALL)
-    summary = build_shards(front_job(front, tmp_path / "shards", recipe=recipe))
-    assert summary.statuses == {"prepared": 5, "filtered": 1}
-    index = read_index(tmp_path / "shards")
-    assert (index["label_set"], index["room_type"]) == ("front3d_all", "all")
-    classes = {name for line in summary.lines for name in line.classes}
-    assert {"stool", "bookshelf", "sofa", "double_bed"} <= classes
-
-
-def test_a_type_that_no_room_has(front):
-    flat(front)
-    with pytest.raises(InputError, match=r"selects \(attic\); the folder has .*LivingRoom \(1\)"):
+    with refused("front/type of no room", tmp=front.root):
         survey(front, "bedroom", "room_types=[attic]")
+    with refused("front/room without its house", tmp=front.root):
+        survey(front, "bedroom", only="MasterBedroom-1")
+    assert len(survey(front, "bedroom", only="flat/MasterBedroom-1").rooms) == 1
 
 
 def test_the_views_of_a_house(front):
@@ -119,7 +108,7 @@ def test_pieces_and_floors_are_what_the_shared_houses_promise():
     pieces, areas = defaultdict(list), defaultdict(list)
     for path in sorted((folder / "3D-FRONT").glob("*.json")):
         result = read_house(path, bank, recipe, lambda _, kind: kind in kinds, load_models=False)
-        assert not result.failures and not result.filtered
+        assert not result.left_out
         for item in result.rooms:
             assert not item.notes
             pieces[item.type].append(len(item.furniture))
@@ -129,13 +118,3 @@ def test_pieces_and_floors_are_what_the_shared_houses_promise():
         assert len(pieces[kind]) == want["rooms"] and max(pieces[kind]) == want["objects max"]
         assert np.mean(pieces[kind]) == pytest.approx(want["objects mean"], abs=0.0051)
         assert np.mean(areas[kind]) == pytest.approx(want["area mean m2"], abs=0.051)
-
-
-def test_a_room_that_is_asked_for_without_its_house_is_explained(front):
-    flat(front)
-    said = (
-        r"--only takes HOUSE, .*\. A room is named with its house: --only HOUSE/MasterBedroom-1\."
-    )
-    with pytest.raises(InputError, match=said):
-        survey(front, "bedroom", only="MasterBedroom-1")
-    assert len(survey(front, "bedroom", only="flat/MasterBedroom-1").rooms) == 1

@@ -9,6 +9,7 @@ import shapely
 from data_prep.front.furnished import Room
 from data_prep.front.recipe import ViewRules
 from data_prep.front.viewpoints import Viewpoints, camera_pose, intrinsics, sees_enough, view_counts
+from sceneprior.core.cameras import camera_centers
 
 RULES = ViewRules()
 L_SHAPE = [(-2, -3), (2, -3), (2, 0), (0, 0), (0, 3), (-2, 3)]
@@ -31,13 +32,7 @@ def draw(count, outline=L_SHAPE, furniture=None, rules=RULES, seed=0):
     )
     cameras = [spots.draw() for _ in range(count)]
     turns = np.stack([camera.world_to_camera for camera in cameras])
-    eyes = -np.einsum("nji,nj->ni", turns[:, :3, :3], turns[:, :3, 3])
-    return cameras, turns, eyes
-
-
-def test_the_papers_lens():
-    # 90 degrees across 480 pixels: the focal length is half the width.
-    np.testing.assert_allclose(intrinsics(RULES), [[240, 0, 240], [0, 240, 180], [0, 0, 1]])
+    return cameras, turns, camera_centers(turns)
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.7, -2.1])
@@ -111,6 +106,8 @@ def test_narrow_and_crowded_rooms_still_get_cameras():
 
 
 def test_views_follow_the_floor_area():
+    # The paper's lens: 90 degrees across 480 pixels, so the focal length is half the width.
+    np.testing.assert_allclose(intrinsics(RULES), [[240, 0, 240], [0, 240, 180], [0, 0, 1]])
     assert view_counts([12.0, 20.0], RULES) == [24, 40]
     assert view_counts([1.0], RULES) == [8]  # at least
     assert view_counts([60.0], RULES) == [100]  # a house at most
@@ -139,7 +136,7 @@ def test_slivers_of_floor_far_apart_take_no_time():
     room = Room("house_A", "Bedroom", floor, 2.7, ())
     spots = Viewpoints(room, np.zeros((0, 2, 3)), np.zeros((0, 3)), RULES, np.random.default_rng(0))
     turns = np.stack([spots.draw().world_to_camera for _ in range(5)])
-    eyes = -np.einsum("nji,nj->ni", turns[:, :3, :3], turns[:, :3, 3])
+    eyes = camera_centers(turns)
     assert shapely.distance(floor, shapely.points(eyes[:, [0, 2]])).max() < 2e-3
 
 

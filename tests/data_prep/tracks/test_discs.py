@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from data_prep.tracks.discs import (
+from data_prep.tracks.carving import cameras_of
+from data_prep.tracks.singleton_merge import (
     LARGER,
     LEAST,
     MISFIT,
@@ -11,10 +12,9 @@ from data_prep.tracks.discs import (
     Discs,
     balls_of,
     discs_of,
-    join_singles,
+    merge_singletons,
     misfits,
 )
-from data_prep.tracks.voxels import cameras_of
 
 
 def seen(middles_m, radius_m, eyes_m) -> Discs:
@@ -32,19 +32,21 @@ TWO = np.array([[0.8, 0.3, 0.5], [-0.7, -0.4, 0.9]])
 def test_singles_of_each_ball_join():
     discs, view = seen(TWO, 0.2, EYES), np.repeat(np.arange(4), 2)
     same = np.ones(8, dtype=np.int64)
-    np.testing.assert_array_equal(join_singles(np.arange(8), discs, view, same), [0, 1] * 4)
+    np.testing.assert_array_equal(merge_singletons(np.arange(8), discs, view, same), [0, 1] * 4)
 
 
 def test_two_views_other_classes_and_larger_clusters_do_not_join():
     discs, view = seen(TWO[:1], 0.2, EYES), np.arange(4)
     apart = np.arange(4)
-    np.testing.assert_array_equal(join_singles(apart, discs, view, np.array([1, 1, 2, 2])), apart)
+    np.testing.assert_array_equal(
+        merge_singletons(apart, discs, view, np.array([1, 1, 2, 2])), apart
+    )
     some = np.array([0, 1, 2, 2])
-    np.testing.assert_array_equal(join_singles(some, discs, view, np.ones(4, int)), some)
+    np.testing.assert_array_equal(merge_singletons(some, discs, view, np.ones(4, int)), some)
     small = discs._replace(radii=discs.radii * [1, 1, 5, 5])
-    np.testing.assert_array_equal(join_singles(apart, small, view, np.ones(4, int)), apart)
+    np.testing.assert_array_equal(merge_singletons(apart, small, view, np.ones(4, int)), apart)
     gone = discs._replace(radii=discs.radii * [1, 1, 0, 0])
-    np.testing.assert_array_equal(join_singles(apart, gone, view, np.ones(4, int)), apart)
+    np.testing.assert_array_equal(merge_singletons(apart, gone, view, np.ones(4, int)), apart)
 
 
 def test_masks_of_wrong_poses_stay_alone():
@@ -52,9 +54,9 @@ def test_masks_of_wrong_poses_stay_alone():
     eyes_m = np.random.default_rng(0).uniform(-3, 3, (MOST + 1, 3))
     discs, view = seen(TWO[:1], 0.2, eyes_m), np.arange(MOST + 1)
     same = np.ones(MOST + 1, dtype=np.int64)
-    np.testing.assert_array_equal(join_singles(view, discs, view, same), view)
+    np.testing.assert_array_equal(merge_singletons(view, discs, view, same), view)
     fewer = Discs(*(each[:MOST] for each in discs))
-    assert not join_singles(view[:MOST], fewer, view[:MOST], same[:MOST]).any()
+    assert not merge_singletons(view[:MOST], fewer, view[:MOST], same[:MOST]).any()
 
 
 def test_misfits_by_hand():

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from untracked_room import frames, furnished
 
-from data_prep.tracks.affinity import pair_weights
-from data_prep.tracks.explained import EVERY, explained
-from data_prep.tracks.rays import BEHIND, first_hits, surface, widened
-from data_prep.tracks.voxels import CLEAR_M, cameras_of, fill
+from data_prep.tracks.carving import BEHIND, CLEAR_M, cameras_of, fill, first_hits, surface, widened
+from data_prep.tracks.cluster_merge import EVERY, hull_coverage
+from data_prep.tracks.clusters import pair_weights
 
 
 @pytest.fixture(scope="module")
@@ -108,12 +107,12 @@ def test_widened_masks_keep_other_masks(scene):
         assert wide[view, row, column] in around
 
 
-def test_explained_shares(scene):
+def test_hull_coverage(scene):
     """A ray is explained by a cluster if a cell on it is in the cluster's hull, counted by hand."""
     ids, true, cameras, grid = scene
     labels = np.unique(true, return_inverse=True)[1]
     near = widened(ids)
-    share = explained(ids, near, labels, cameras, grid)
+    share = hull_coverage(ids, near, labels, cameras, grid)
 
     @functools.cache
     def counted(cell):

@@ -4,9 +4,8 @@ import numpy as np
 from jaxtyping import Int
 from scipy import ndimage
 
-from data_prep.tracks.explained import explained
-from data_prep.tracks.rays import Surface, votes_of, widened
-from data_prep.tracks.voxels import Cameras, Grid
+from data_prep.tracks.carving import Cameras, Grid, Surface, votes_of, widened
+from data_prep.tracks.cluster_merge import hull_coverage
 
 LEAST_CELLS = 4
 """Minimum number of cells that each part of a mask must show."""
@@ -26,7 +25,7 @@ Split = list[tuple[int, int]]
 """Pairs of a mask and a second cluster that the mask shows."""
 
 
-def split_merged(
+def split_masks(
     full: Int[np.ndarray, "views rows columns"],
     step: int,
     seen: Surface,
@@ -52,7 +51,7 @@ def split_merged(
     parted = cut(full, step, split, seen, labels, mask_view, cameras, grid)
     ids = np.ascontiguousarray(parted[:, ::step, ::step])
     own = np.array([labels[mask] for mask, _ in split])
-    share = explained(ids, widened(ids), np.concatenate([labels, own]), cameras, grid)
+    share = hull_coverage(ids, widened(ids), np.concatenate([labels, own]), cameras, grid)
     rows, others = len(labels) + np.arange(len(split)), np.array([other for _, other in split])
     pixels = np.bincount(parted[parted > 0], minlength=rows[-1] + 2)[rows + 1]
     kept = (share[rows, own] <= OWN) & (share[rows, others] >= OTHER)

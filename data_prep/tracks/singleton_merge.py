@@ -1,4 +1,4 @@
-"""Joins single masks to objects, by the directions and sizes in which they show a common ball.
+"""Merges masks that are alone, by the directions and sizes in which they show a common ball.
 
 An object that few views show, some of them without its mask, may have no filled cell: then its
 masks share no surface, and each stays alone. Their middles still meet in a point, and their sizes
@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from data_prep.tracks.voxels import MIN_DEPTH_M, Cameras
+from data_prep.tracks.carving import MIN_DEPTH_M, Cameras
 from sceneprior.core.cameras import nearest_to_rays
 
 LEAST = 3
@@ -91,13 +91,13 @@ def misfits(balls: Balls, discs: Discs) -> Float[np.ndarray, "balls discs"]:
     return np.where(ahead > 0, off**2 + larger**2, np.inf).round(_DIGITS)
 
 
-def join_singles(
+def merge_singletons(
     labels: Int[np.ndarray, " masks"],
     discs: Discs,
     mask_view: Int[np.ndarray, " masks"],
     mask_class: Int[np.ndarray, " masks"],
 ) -> Int[np.ndarray, " masks"]:
-    """Join masks of one class that are alone in their clusters, and that show the same ball.
+    """Merge masks of one class that are alone in their clusters, and that show the same ball.
 
     Of the balls of all pairs, the one that most views show is chosen, and of those the one with the
     smallest mean misfit. Its masks are joined, and the next ball is chosen from the others. If a
