@@ -12,7 +12,7 @@ from data_prep.front.recipe import Recipe, ViewRules
 from data_prep.front.viewpoints import Viewpoints, intrinsics, sees_enough
 from sceneprior.core.cameras import Pinhole
 from sceneprior.core.classes import STUFF, VOID, class_colors, label_set
-from sceneprior.core.instances.observations import observe, pixel_counts
+from sceneprior.core.observations import observe, pixel_counts
 from sceneprior.core.scene import Mesh
 from sceneprior.core.shards import (
     RoomGroundTruth,

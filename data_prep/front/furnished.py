@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 
 from data_prep.front.recipe import Recipe
-from sceneprior.core.instances.checked import shown
+from sceneprior.core.checked import shown
 from sceneprior.core.scene import Mesh
 
 

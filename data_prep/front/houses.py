@@ -20,10 +20,10 @@ from data_prep.front.geometry import (
 )
 from data_prep.front.models import ModelBank, unit_of
 from data_prep.front.recipe import Recipe
+from sceneprior.core.checked import shown
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import is_name, read_json
 from sceneprior.core.furniture import MODEL_FILE, tidy_category
-from sceneprior.core.instances.checked import shown
 from sceneprior.core.scene import Mesh
 
 _NO_MESH = Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
