@@ -29,8 +29,8 @@ from lightning.pytorch.strategies import DDPStrategy, StrategyRegistry
 from timed_fit import made_shards, paper_run, timed_fit
 from torch import distributed as dist
 
+from sceneprior.training.callbacks import first_process
 from sceneprior.training.checkpoints import read_checkpoint
-from sceneprior.training.slurm import first_process
 
 STAGES = ("layout", "shape")
 

@@ -15,8 +15,8 @@ import torch
 from lightning.pytorch.callbacks import Callback
 
 from sceneprior.apps.config import load_config
+from sceneprior.training.callbacks import first_process
 from sceneprior.training.fit import fit
-from sceneprior.training.slurm import first_process
 
 
 class Recorder(Callback):

@@ -18,12 +18,18 @@ from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 from sceneprior.core.errors import ConfigError, InputError
 from sceneprior.core.files import only_writer, remove_parts
 from sceneprior.core.settings import check_settings, dump_settings, read_settings
-from sceneprior.training.callbacks import RollingCheckpoint, RunProgress, StepSeed
+from sceneprior.training.callbacks import (
+    RollingCheckpoint,
+    RunProgress,
+    StepSeed,
+    first_process,
+    requeue_on_signal,
+    slurm_plugins,
+)
 from sceneprior.training.checkpoints import check_resumable, read_checkpoint, write_checkpoint
 from sceneprior.training.loader import make_loader
 from sceneprior.training.method import RunConfig, Stage
 from sceneprior.training.settings import without_samples
-from sceneprior.training.slurm import first_process, requeue_on_signal, slurm_plugins
 
 LOGGERS = ("csv", "tensorboard", "wandb")
 """Names of the loggers that `fit` accepts."""

@@ -95,7 +95,7 @@ def test_an_array_job_is_queued_again_by_its_own_name(slurm, toy_shards, tmp_pat
 
 
 def test_outside_of_slurm_signals_are_left_alone(monkeypatch):
-    from sceneprior.training.slurm import requeue_on_signal, slurm_plugins
+    from sceneprior.training.callbacks import requeue_on_signal, slurm_plugins
 
     monkeypatch.delenv("SLURM_NTASKS", raising=False)
     before = signal.getsignal(signal.SIGUSR1)
