@@ -192,7 +192,7 @@ def read_latent(trained: TrainedPrior, text: str) -> Float[Tensor, " dimension"]
     else:
         known = f"names such as {names[0]}" if names else "no names"
         raise InputError(f"{path} has no latent '{item}': it holds {len(latents)} and {known}.")
-    return _onto(trained, latents[row], f"{path}, row {row},")
+    return _onto(trained, latents[row], f"{path}, row {row}")
 
 
 def named_latent(trained: TrainedPrior, name: str, or_else: str) -> Float[Tensor, " dimension"]:

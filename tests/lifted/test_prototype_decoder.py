@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from parts_of_rooms import CORNER, boxes
+from parts_of_rooms import CORNER
 from tiny_runs import tiny_lifted
 
 from sceneprior.core.boxes import turn_grids
@@ -85,30 +85,6 @@ def test_meshes_turn_and_fill_boxes_as_grids_do():
         assert here.volume == pytest.approx(turned.mean() * own_m.prod(), rel=0.02)
         middle_m = points[turned].mean(axis=0) * own_m + center_m
         np.testing.assert_allclose(here.center_mass, middle_m, atol=0.01)
-
-
-def test_a_look_stretches_into_its_box_and_boards_keep_their_thickness():
-    decoder = PrototypeConfig(prototypes=1, codes=8, cells=16).build(6)
-    table = boxes((0, 64, 60, 64, 0, 64), (0, 4, 0, 60, 0, 4), mirrored=(0, 3))
-    grids = filled_cells(table, 16, 1.1)[None]
-    decoder.set_prototypes(
-        Prototypes((table,), grids, np.ones((1, 3)), np.array([1]), np.ones(1, bool))
-    )
-    box = np.array([0, 0, 0, 2.0, 1.5, 3.0])
-    heights = np.unique(decoder.mesh(0, box).vertices_m[:, 1].round(3))
-    assert heights[0] == -0.75 and heights[-1] == 0.75
-    assert np.abs(heights - (0.75 - 4 / 64)).min() < 2e-3
-
-
-def test_the_prior_decodes_looks_in_place_of_meshes(prior, torch_rng):
-    logits = torch.randn(3, 10, generator=torch_rng)
-    scenes = prior(logits)
-    assert prior.faces is None and scenes.vertices_m is None
-    assert scenes.looks.shape == (3, 6)
-    bare = prior(logits, with_shape=False)
-    assert scenes.shape_codes.shape == (3, 6, 4)
-    assert bare.looks is None and torch.equal(bare.shape_codes, scenes.shape_codes)
-    assert torch.equal(bare.centers_m, scenes.centers_m)
 
 
 def test_solids_of_a_look_cover_its_mesh_in_every_pose():

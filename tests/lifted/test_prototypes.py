@@ -78,16 +78,6 @@ def test_distances_are_those_of_a_loop():
             assert ours[a, b] == pytest.approx(each, abs=1e-6)
 
 
-@pytest.mark.parametrize("layers", [CELLS // 8, CELLS // 2])
-def test_thin_things_are_as_far_apart_as_full_ones(layers):
-    """A floor from a ceiling, or a lower half from an upper one."""
-    both = np.zeros((2, CELLS, CELLS, CELLS), dtype=bool)
-    both[0, :, :layers], both[1, :, -layers:] = True, True
-    sizes = np.ones((2, 3))
-    apart = pose_distances((both, sizes), (both, sizes)).min(axis=2)
-    assert apart == pytest.approx(np.array([[0, 2], [2, 0]]))
-
-
 @pytest.mark.parametrize("codes", [3, 40])
 def test_codes_are_as_far_apart_as_the_grids_of_looks(codes):
     grids = RNG.random((4, CELLS, CELLS, CELLS)) < 0.5

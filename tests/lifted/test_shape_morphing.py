@@ -93,18 +93,3 @@ def test_shapes_are_the_decoded_ones_at_the_ends_and_change_between(decoder):
     no_looks = DecodedScenes(*(getattr(bare, name) for name in (
         "class_logits", "centers_m", "sizes_m", "completeness_logits")))  # fmt: skip
     assert decoder.along_path(no_looks, places[:2], no_looks, torch.ones(2, 1) > 0) is no_looks
-
-
-def test_a_shape_changes_gradually_however_many_steps_are_drawn(decoder):
-    looks = [3] * 65 + [12] * 64
-    kept = torch.ones(STEPS, 1, dtype=torch.bool)
-    volumes = {}
-    for steps in (9, 33):
-        rows = np.linspace(0, STEPS - 1, steps).astype(int)
-        places = torch.linspace(0, 1, steps, dtype=torch.float64)
-        rooms = decoder.along_path(decoded([looks[k] for k in rows]), places, decoded(looks), kept)
-        meshes = [decoder.mesh_of(rooms, room, 0) for room in range(steps)]
-        volumes[steps] = [trimesh.Trimesh(m.vertices_m, m.faces).volume for m in meshes]
-    np.testing.assert_allclose(volumes[33][::4], volumes[9], atol=1e-9)
-    ends = abs(volumes[33][-1] - volumes[33][0])
-    assert np.abs(np.diff(volumes[33])).max() < max(ends, 0.1) / 3

@@ -5,17 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from parts_of_rooms import boxes
-from tiny_runs import tiny_config, tiny_lifted
+from tiny_runs import tiny_config
 
-from sceneprior.apps.config import load_run
-from sceneprior.apps.sample import sample_rooms
-from sceneprior.core.parts import filled_cells
 from sceneprior.core.scene import Scene
 from sceneprior.core.views import DecodedScenes
-from sceneprior.lifted.prototypes import POSES, Prototypes
-from sceneprior.paper import decode
-from sceneprior.paper.decode import decode_training_rooms, to_rooms
+from sceneprior.paper.decode import to_rooms
 from sceneprior.paper.prior import ScenePrior
 
 
@@ -84,41 +78,3 @@ def test_nothing_complete_is_an_empty_room_and_no_vertices_are_boxes(decoded, pr
     ]
     boxes = replace(decoded, vertices_m=None)
     assert scenes_of(boxes, prior, "front3d_bedroom", ["a", "b"])[0].objects[0].mesh is None
-
-
-def test_looks_become_meshes_in_the_boxes_of_objects_that_are_kept(decoded, tmp_path):
-    halves = boxes((0, 64, 0, 32, 0, 64)), boxes((0, 32, 0, 64, 0, 64))
-    grids = np.stack([filled_cells(each, 8, 1.1) for each in halves])
-    prior = tiny_lifted(tmp_path).build_prior()
-    prior.shape.set_prototypes(
-        Prototypes(halves, grids, np.ones((2, 3)), np.array([9, 13]), np.ones(2, dtype=bool))
-    )
-    looks = torch.tensor([[0, POSES, 0, 0], [0, 0, 0, 0]])
-    chosen = replace(decoded, vertices_m=None, looks=looks)
-    scenes = scenes_of(chosen, prior, "front3d_bedroom", ["a", "b"])
-    for item, share in zip(scenes[0].objects, ([1, 0.5, 1], [0.5, 1, 1], [1, 0.5, 1]), strict=True):
-        low, high = item.mesh.vertices_m.min(axis=0), item.mesh.vertices_m.max(axis=0)
-        bottom = np.subtract(item.center_m, np.divide(item.size_m, 2))
-        np.testing.assert_allclose(low, bottom, atol=1e-6)
-        np.testing.assert_allclose(high - low, np.multiply(item.size_m, share), atol=2e-3)
-
-
-def test_synthesis_is_named_by_seed_and_does_not_depend_on_batches(trained, monkeypatch):
-    scenes = sample_rooms(trained, 5, 7)
-    assert [scene.name for scene in scenes] == [f"seed7_000{k}" for k in range(5)]
-    monkeypatch.setattr(decode, "BATCH", 2)
-    again = sample_rooms(trained, 5, 7)
-    for one, other in zip(scenes, again, strict=True):
-        assert labels(one) == labels(other)
-        np.testing.assert_allclose(one.centers_m, other.centers_m, atol=1e-5)
-    for scene in scenes:
-        for item in scene.objects:
-            # Stage 2 has run: meshes, which fill their boxes (fit_box).
-            low, high = item.mesh.vertices_m.min(axis=0), item.mesh.vertices_m.max(axis=0)
-            np.testing.assert_allclose(high - low, item.size_m, rtol=1e-4)
-
-
-def test_a_run_that_stopped_before_the_shape_stage_gives_boxes(toy_run):
-    trained = replace(load_run(toy_run), stage="layout")
-    scenes = decode_training_rooms(trained)
-    assert all(item.mesh is None for scene in scenes for item in scene.objects)

@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import pytest
 import torch
+from refusals import refused
 from torch.nn import functional as F
 from torch.testing import assert_close
 
-from sceneprior.core.errors import InputError
-from sceneprior.core.observed_image import as_views, images_of_split, rows_of
+from sceneprior.core.observed_image import as_views, images_of_split
 from sceneprior.paper import fit_image as fitting
 from sceneprior.paper.fit_image import FitSchedule, decode_images, fit_latents_to_images, view_loss
 
@@ -49,24 +49,6 @@ def test_it_is_pytorchs_rmsprop_with_the_papers_drop(trained, views, start):
     assert_close(fit.z, by_pytorch(trained, views, start, SHORT), rtol=1e-4, atol=1e-5)
     assert_close(fit.z.norm(dim=1), torch.ones(len(start)), rtol=1e-6, atol=0)
     assert fit.steps.tolist() == [12] * len(start)
-
-
-def test_the_score_never_rises_and_mostly_falls(trained, views, start):
-    with torch.no_grad():
-        before = view_loss(trained, decode_images(trained, start, views), views)
-    fit = fit_latents_to_images(trained, views, start, FitSchedule(steps=60, drop_at=40))
-    assert (fit.loss.score <= before.score + 1e-6).all()
-    assert fit.loss.score.mean() < before.score.mean() - 0.05
-
-
-def test_alone_or_among_others_an_image_has_the_same_answer(trained, views, start):
-    together = fit_latents_to_images(trained, views, start, SHORT)
-    for row in range(len(start)):
-        alone = fit_latents_to_images(
-            trained, rows_of(views, torch.tensor([row])), start[:1], SHORT
-        )
-        # Sums in another order; a matching that is a tie could still tell them apart.
-        assert_close(alone.z[0], together.z[row], rtol=1e-3, atol=1e-4)
 
 
 def test_images_that_do_not_move_stop_early_and_others_go_on(trained, views, start):
@@ -117,5 +99,5 @@ def test_more_objects_than_the_prior_generates(trained, views, start):
         visible=views.visible[:, :, many],
         sides_clear=views.sides_clear[:, :, many],
     )
-    with pytest.raises(InputError, match=r"toy_test_00_view\d shows 7 objects, but .* at most 6"):
+    with refused("paper/more objects than generated"):
         fit_latents_to_images(trained, crowded, start)

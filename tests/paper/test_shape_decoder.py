@@ -40,13 +40,6 @@ def test_fit_box_fills_the_unit_box_exactly(torch_rng, dtype):
     assert torch.equal(fitted.argsort(dim=-2), vertices.argsort(dim=-2))
 
 
-def test_fill_unit_box_keeps_what_already_fills_it_and_survives_a_flat_mesh():
-    cube = to_cube(icosphere(2)[0])
-    assert_close(fill_unit_box(cube), cube, rtol=0, atol=1e-6)
-    flat = cube * torch.tensor([1.0, 0, 1])
-    assert torch.isfinite(fill_unit_box(flat)).all()
-
-
 def test_the_split_first_layer_is_the_concatenated_one(torch_rng):
     """Equation 6 as written, MLP3(Concat[feature, v]), one vertex at a time."""
     torch.manual_seed(0)
@@ -73,17 +66,6 @@ def small_prior() -> ScenePrior:
         shape=ShapeDecoderConfig(width=8, level=1, template="box", fit_box=True),
     )
     return ScenePrior(config, classes=5).double()
-
-
-def test_the_prior_places_meshes_in_the_boxes_of_the_layout(torch_rng):
-    prior = small_prior()
-    logits = torch.randn(3, 9, generator=torch_rng, dtype=torch.float64)
-    scenes = prior(logits)
-    low, high = scenes.vertices_m.amin(dim=-2), scenes.vertices_m.amax(dim=-2)
-    assert_close((low + high) / 2, scenes.centers_m, rtol=0, atol=1e-12)
-    assert_close(high - low, scenes.sizes_m, rtol=0, atol=1e-12)
-    bare = prior(logits, with_shape=False)
-    assert bare.vertices_m is None and torch.equal(bare.centers_m, scenes.centers_m)
 
 
 def test_meshes_of_some_objects_are_those_of_all(torch_rng):

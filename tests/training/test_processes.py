@@ -14,6 +14,8 @@ from toy_rooms import write_toy_shards
 
 from sceneprior.training.checkpoints import read_checkpoint
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 ROOMS = 13  # two batches of 6 and one of 1, which leaves one of two processes without a room
 

@@ -13,6 +13,8 @@ from sceneprior.training.callbacks import StepSeed
 from sceneprior.training.checkpoints import read_checkpoint
 from sceneprior.training.fit import fit
 
+pytestmark = pytest.mark.slow
+
 CPU = {"accelerator": "cpu", "devices": 1}
 
 

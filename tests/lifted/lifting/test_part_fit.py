@@ -10,7 +10,6 @@ from sceneprior.core.parts import (
     BOX,
     CYLINDER,
     MOST_CORNERS,
-    MOST_PARTS,
     Parts,
     filled_cells,
     surface_of_parts,
@@ -37,22 +36,6 @@ def found_again(parts: Parts, hull=None):
 def test_furniture_is_found_again_in_as_few_parts(parts, most):
     found, iou = found_again(parts)
     assert iou > 0.9 and len(found.kind) <= most
-
-
-def test_legs_are_found_below_a_table_whose_hull_is_full():
-    hull = filled_cells(boxes((0, 64, 0, 64, 0, 64)), CELLS, MARGIN)
-    found, iou = found_again(TABLE, hull)
-    assert iou > 0.8
-    assert not filled_cells(found, CELLS, MARGIN)[12:20, 4:20, 12:20].any(), "air under the table"
-
-
-def test_a_round_table_is_found_in_few_parts():
-    """Often as crossed boxes rather than a cylinder."""
-    top = [[-0.5, 0.5], [0.3, 0.5], [-0.5, 0.5]]
-    stem = [[-0.125, 0.125], [-0.5, 0.3], [-0.125, 0.125]]
-    parts = Parts(np.array([CYLINDER, BOX]), np.zeros(2, int), np.array([top, stem]))
-    found, iou = found_again(parts)
-    assert iou > 0.85 and len(found.kind) <= 4
 
 
 def test_what_hangs_reaches_the_ceiling_and_what_stands_the_floor():
@@ -121,20 +104,6 @@ def test_objects_without_rays_are_their_box():
     np.testing.assert_array_equal(found.ends, [[[-0.5, 0.5]] * 3])
 
 
-@pytest.mark.parametrize("hit", [False, True])
-def test_rays_that_all_say_the_same_end_in_parts(hit):
-    rays = rays_of(TABLE, 200)
-    found = fit_parts(rays._replace(hits=np.full(200, hit)), np.ones((CELLS,) * 3, bool), MARGIN)
-    assert 1 <= len(found.kind) <= MOST_PARTS and np.isfinite(found.ends).all()
-
-
-def test_the_same_rays_give_the_same_parts():
-    hull = filled_cells(CORNER, CELLS, MARGIN)
-    one, other = (fit_parts(rays_of(CORNER, 1500), hull, MARGIN) for _ in range(2))
-    for here, there in zip(one, other, strict=True):
-        np.testing.assert_array_equal(here, there)
-
-
 def test_the_loss_is_the_formula_of_the_docstring():
     rays = rays_of(TABLE, 500)
     fit = RayFit(rays, MARGIN)
@@ -148,19 +117,6 @@ def test_the_loss_is_the_formula_of_the_docstring():
     assert fit.loss(upper) == pytest.approx(
         0.5 * missed / (rays.hits.sum() + 50) + 0.002 + 0.002 - 0.0005 / 8 + 0.06 * 56 / 64
     )
-
-
-def test_upright_rays_are_hits_within_the_outline():
-    diamond = np.array([[0, -0.5], [0.5, 0], [0, 0.5], [-0.5, 0]])
-    rays = rays_of(TABLE, 400)
-    plain, cut = RayFit(rays, MARGIN), RayFit(rays, MARGIN, diamond)
-    for fit, share in ((plain, 1.0), (cut, 0.5)):
-        upright = np.abs(fit.spans[:, [0, 2]]).max(axis=1) < 1e-5
-        assert fit.hits[upright].all() and upright.sum() == round(0.075 * (~upright).sum())
-        x, z = (fit.starts[upright][:, [0, 2]] / 64 - 0.5).T
-        assert (np.abs(x) + np.abs(z)).max() <= share
-    assert cut.miss_price > plain.miss_price, "fewer rays pass within the outline"
-    assert len(cut.hits) < len(plain.hits), "some pass beyond it"
 
 
 def test_a_round_bench_keeps_its_outline():

@@ -10,7 +10,6 @@ from sceneprior.lifted.lifting.part_loss import RayFit
 from sceneprior.lifted.lifting.part_rays import count_wrong, descend, meets
 from sceneprior.lifted.lifting.part_regularizers import (
     LEVELS,
-    count_planes,
     gap_and_pieces,
     overhang,
     planes_of,
@@ -91,14 +90,6 @@ def test_moving_faces_never_makes_more_rays_wrong_and_keeps_the_counts():
         assert moved.ends.min() >= 0 and moved.ends.max() <= LEVELS
 
 
-def test_planes_are_shared_by_parts_and_by_mirror_images():
-    ends = np.array([[[0, 64], [56, 64], [0, 64]], [[0, 8], [0, 56], [4, 8]]])
-    assert count_planes(ends) == 1 + 1 + 2  # y 56; x 8; z 4 and 8
-    mirrored = ends.copy()
-    mirrored[1, 0] = 56, 64  # the mirror image of x 8
-    assert count_planes(np.concatenate([ends, mirrored[1:]])) == 4
-
-
 def test_gaps_are_those_to_the_floor_or_the_ceiling():
     legs = np.array([[[0, 8], [0, 40], [0, 8]]])
     top = np.array([[[0, 64], [41, 60], [0, 64]]])
@@ -136,19 +127,6 @@ def test_a_table_on_one_leg_would_tip_over():
     assert overhang(np.array([0, ACROSS_Z]), ends, EVERYWHERE) == 32 - 8
     ends[1, [0, 2]] = 28, 36  # a pedestal
     assert overhang(np.array([0, 0]), ends, EVERYWHERE) == 0
-
-
-def test_the_centre_and_the_middle_are_above_the_feet():
-    """A block is heavier than what it carries: the centre is above it, the middle is not."""
-    ends = np.array([[[0, 20], [0, 60], [0, 64]], [[0, 64], [60, 64], [0, 64]]])
-    volumes = np.array([20 * 60 * 64, 64 * 4 * 64])
-    assert (volumes * [10, 32]).sum() / volumes.sum() < 20
-    assert overhang(np.array([0, 0]), ends, EVERYWHERE) == 32 - 20
-    # The middle is above the feet, and the centre is not.
-    ends = np.array([[[0, 40], [0, 4], [0, 64]], [[32, 64], [4, 64], [0, 64]]])
-    volumes = np.array([40 * 4 * 64, 32 * 60 * 64])
-    center = (volumes * [20, 48]).sum() / volumes.sum()
-    assert overhang(np.array([0, 0]), ends, EVERYWHERE) == pytest.approx(center - 40)
 
 
 def test_wrong_rays_of_several_objects_are_counted_at_once():

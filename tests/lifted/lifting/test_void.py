@@ -76,22 +76,3 @@ def test_rays_through_void_tell_nothing():
     ids[ids == 0] = 2  # void wherever the bed is not
     pool = draw_rays(replace(room, instance_ids=ids), boxes, 200, GRID.margin)
     assert pool.hits.all(), "no ray is empty"
-
-
-def test_rays_through_an_object_without_a_box_tell_nothing():
-    """A single view does not determine the place of an object, so its box is a placeholder."""
-    room = room_of(3)
-    boxes = lift_boxes(room)
-    visible = room.visible.copy()
-    visible[1:, 1] = False
-    once = replace(room, visible=visible)
-    unknown = lift_boxes(once)
-    assert unknown.explained[1] == 0 < unknown.explained[0]
-    for at_m in (boxes.centers_m[1], -3 * boxes.centers_m[1]):
-        centers_m = unknown.centers_m.copy()
-        centers_m[1] = at_m
-        pool = draw_rays(once, unknown._replace(centers_m=centers_m), 400, GRID.margin)
-        without = np.where(room.instance_ids == 2, 3, room.instance_ids)
-        as_void = draw_rays(replace(once, instance_ids=without), unknown, 400, GRID.margin)
-        for one, other in zip(pool, as_void, strict=True):
-            np.testing.assert_array_equal(one[0], other[0])
