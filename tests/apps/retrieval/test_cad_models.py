@@ -1,35 +1,30 @@
-"""CAD models by class: which there are, which are broken, and that points are drawn once."""
+"""CAD models of folders: which there are, which are broken, and that points are sampled once."""
 
 import numpy as np
 import pytest
 import trimesh
 from model_folder import blocks, corner_sofa, write_model, write_models
+from refusals import refused
 
 from sceneprior.apps.retrieval import model_folders
 from sceneprior.apps.retrieval.cad_models import open_models
-from sceneprior.core.errors import InputError
+from sceneprior.apps.retrieval.model_folders import class_of_folder, read_glb
+from sceneprior.core.errors import InputWarning
+
+BED = blocks(((0, 0.3, 0), (1.8, 0.6, 2.0)), ((0, 0.6, -0.95), (1.8, 1.2, 0.1)))
 
 
 @pytest.fixture
 def folder(tmp_path):
-    """Two beds, one a hundred times too large, a flat table, a toy, and four broken ones."""
-    bed = blocks(((0, 0.3, 0), (1.8, 0.6, 2.0)), ((0, 0.6, -0.95), (1.8, 1.2, 0.1)))
-    huge = bed.copy()
+    """3D-FUTURE's layout: two beds, one a hundred times too large, a flat table, a toy, and four
+    broken models."""
+    huge = BED.copy()
     huge.apply_scale(100)
     flat = trimesh.Trimesh([[0, 0, 0], [2, 0, 0], [2, 0, 1], [0, 0, 1]], [[0, 1, 2], [0, 2, 3]])
-    made = write_models(
-        tmp_path / "models",
-        {
-            "bed": ("King-size Bed", bed),
-            "huge": ("King-size Bed", huge),
-            "flat": ("Dining Table", flat),
-            "toy": ("Toy", bed),
-            "nan": ("Nightstand", bed),
-            "faceless": ("Nightstand", bed),
-            "missing": ("Nightstand", bed),
-            "point": ("Nightstand", bed),
-        },
-    )
+    kinds = {"bed": ("King-size Bed", BED), "huge": ("King-size Bed", huge)}
+    kinds |= {"flat": ("Dining Table", flat), "toy": ("Toy", BED)}
+    kinds |= dict.fromkeys(("nan", "faceless", "missing", "point"), ("Nightstand", BED))
+    made = write_models(tmp_path / "models", kinds)
     (made / "nan" / "raw_model.obj").write_text("v 0 0 0\nv nan 1 0\nv 1 0 0\nf 1 2 3\n")
     (made / "faceless" / "raw_model.obj").write_text("v 0 0 0\n")
     (made / "point" / "raw_model.obj").write_text("v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n")
@@ -38,29 +33,51 @@ def folder(tmp_path):
 
 
 @pytest.fixture
-def drawn(monkeypatch):
+def own(tmp_path):
+    """The user's layout: two sofas, one a GLB of two placed nodes, a bed by its category, and a
+    bathtub."""
+    home = tmp_path / "mine"
+    for name in ("sofa", "King-Size Bed", "bathtub"):
+        (home / name).mkdir(parents=True)
+    corner_sofa().export(home / "sofa" / "corner.obj")
+    scene = trimesh.Scene()
+    scene.add_geometry(blocks(((0, 0.2, 0), (2, 0.4, 0.8))), node_name="seat")
+    raised = trimesh.transformations.translation_matrix((0, 0.4, 0))
+    scene.add_geometry(blocks(((0, 0.2, -0.3), (2, 0.4, 0.2))), node_name="back", transform=raised)
+    (home / "sofa" / "plain.GLB").write_bytes(scene.export(file_type="glb"))
+    BED.export(home / "King-Size Bed" / "bed.obj")
+    BED.export(home / "bathtub" / "tub.obj")
+    return home
+
+
+@pytest.fixture
+def read(monkeypatch):
     """Names of the folders whose OBJ was read."""
     reads = []
-    read = model_folders.read_obj
+    read_obj = model_folders.read_obj
     monkeypatch.setattr(
-        model_folders, "read_obj", lambda path: reads.append(path.parent.name) or read(path)
+        model_folders, "read_obj", lambda path: reads.append(path.parent.name) or read_obj(path)
     )
     return reads
 
 
-def open_here(folder, points=64):
-    return open_models(folder, "front3d_bedroom", folder.parent / "cache", points)
+def opened(folder, points=64, label_set="front3d_bedroom", **options):
+    return open_models(folder, label_set, folder.parent / "cache", points, **options)
+
+
+def ids_of(models):
+    return {label: some.model_ids for label, some in models.by_class.items()}
 
 
 def test_models_by_class_and_broken_models(folder):
-    models = open_here(folder)
-    assert {label: some.model_ids for label, some in models.by_class.items()} == {
-        "double_bed": ("bed", "huge"),
-        "table": ("flat",),
-    }
-    assert set(models.broken) == {"nan", "faceless", "missing", "point"}
+    info = folder / "model_info.json"
+    info.write_text(info.read_text()[:-1] + ', {"model_id": "../x", "category": "Dining Table"}]')
+    models = opened(folder)
+    assert ids_of(models) == {"double_bed": ("bed", "huge"), "table": ("flat",)}
+    assert set(models.broken) == {"nan", "faceless", "missing", "point", "../x"}
     assert "no usable triangles" in models.broken["nan"] and "no area" in models.broken["point"]
     assert "cannot be read" in models.broken["missing"]
+    assert "cannot be a folder's name" in models.broken["../x"]
     beds = models.by_class["double_bed"].points
     assert beds.shape == (2, 64, 3) and np.abs(beds).max() <= 0.5
     # A hundred times too large is the same model in its unit box.
@@ -69,64 +86,87 @@ def test_models_by_class_and_broken_models(folder):
     np.testing.assert_allclose(np.ptp(models.load("huge").vertices_m, axis=0), 1)
 
 
-def test_points_are_drawn_once_and_again_where_a_file_changed(folder, drawn):
-    first = open_here(folder)
-    assert sorted(drawn) == ["bed", "faceless", "flat", "huge", "nan", "point"]
-    drawn.clear()
-    again = open_here(folder)
-    assert sorted(drawn) == ["faceless", "nan", "point"]  # broken ones may have been mended
-    np.testing.assert_array_equal(
-        first.by_class["double_bed"].points, again.by_class["double_bed"].points
-    )
-    drawn.clear()
+def test_points_are_sampled_once_and_again_where_a_file_changed(folder, read):
+    first = opened(folder).by_class["double_bed"].points
+    assert sorted(read) == ["bed", "faceless", "flat", "huge", "nan", "point"]
+    read.clear()
+    np.testing.assert_array_equal(first, opened(folder).by_class["double_bed"].points)
+    assert sorted(read) == ["faceless", "nan", "point"]  # broken ones may have been mended
+    read.clear()
     write_model(folder, "bed", corner_sofa())
-    changed = open_here(folder)
-    assert "bed" in drawn and "huge" not in drawn
-    beds = changed.by_class["double_bed"].points
-    assert np.abs(beds[0] - first.by_class["double_bed"].points[0]).max() > 0.05
-    np.testing.assert_array_equal(beds[1], first.by_class["double_bed"].points[1])
-    drawn.clear()
-    assert open_here(folder, points=32).by_class["table"].points.shape == (1, 32, 3)
-    assert "huge" in drawn  # other settings, another file
-    assert len(list((folder.parent / "cache").iterdir())) == 2
+    beds = opened(folder).by_class["double_bed"].points
+    assert "bed" in read and "huge" not in read
+    assert np.abs(beds[0] - first[0]).max() > 0.05
+    np.testing.assert_array_equal(beds[1], first[1])
+    read.clear()
+    assert opened(folder, points=32).by_class["table"].points.shape == (1, 32, 3)
+    assert "huge" in read  # other settings, another file
+    files = list((folder.parent / "cache").iterdir())
+    assert len(files) == 2
+    for path in files:
+        path.write_bytes(path.read_bytes()[:100])
+    np.testing.assert_array_equal(beds, opened(folder).by_class["double_bed"].points)
 
 
-def test_a_damaged_file_of_points_is_written_again(folder, drawn):
-    open_here(folder)
-    (path,) = (folder.parent / "cache").iterdir()
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) // 2])
-    drawn.clear()
-    open_here(folder)
-    assert "huge" in drawn and path.read_bytes() == whole
-
-
-def test_what_was_drawn_before_an_interrupt_is_kept(folder, drawn):
+def test_points_sampled_before_an_interrupt_are_kept(folder, read):
     def stop_after_two(ids):
         yield from ids[:2]
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        open_models(folder, "front3d_bedroom", folder.parent / "cache", 64, stop_after_two)
-    done = set(drawn)
-    drawn.clear()
-    open_here(folder)
-    assert not (set(drawn) - {"nan", "faceless", "point"}) & done
+        opened(folder, track=stop_after_two)
+    done = set(read) - {"nan", "faceless", "point"}
+    read.clear()
+    opened(folder)
+    assert done and not set(read) & done
 
 
-def test_folders_without_a_usable_model_are_sentences(folder, tmp_path):
-    with pytest.raises(InputError, match=r"No folder at .*none; --models names"):
-        open_models(tmp_path / "none", "front3d_bedroom", tmp_path)
-    with pytest.raises(InputError) as error:
-        open_models(folder, "void,spaceship", tmp_path)
-    assert "holds no usable model of a class of void,spaceship (8 models listed, 0" in str(
-        error.value
-    )
+def test_own_folders_are_classes_or_categories(own, recwarn):
+    models = opened(own)
+    assert ids_of(models) == {
+        "double_bed": ("King-Size Bed/bed.obj",),
+        "sofa": ("sofa/corner.obj", "sofa/plain.GLB"),
+    }
+    assert not models.broken and not [w for w in recwarn if issubclass(w.category, InputWarning)]
+    np.testing.assert_allclose(np.ptp(models.load("sofa/plain.GLB").vertices_m, axis=0), 1)
+    mesh = read_glb(own / "sofa" / "plain.GLB")
+    assert mesh.vertices_m[:, 1].max() == pytest.approx(0.8)  # nodes are placed
 
 
-def test_ids_that_leave_the_folder_are_broken_models(tmp_path):
-    write_models(tmp_path / "models", {"table": ("Dining Table", corner_sofa())})
-    info = tmp_path / "models" / "model_info.json"
-    info.write_text(info.read_text()[:-1] + ', {"model_id": "../x", "category": "Dining Table"}]')
-    models = open_models(tmp_path / "models", "front3d_bedroom", tmp_path / "cache", 16)
-    assert "cannot be a folder's name" in models.broken["../x"]
+@pytest.mark.parametrize(
+    ("name", "label"),
+    [
+        ("tv_stand", "tv_stand"), ("TV Stand", "tv_stand"), ("barstool", "void"),
+        ("bookcase_jewelry armoire", "bookshelf"), ("toilet", "void"), ("spaceship", None),
+    ],
+)  # fmt: skip
+def test_names_of_folders(name, label):
+    assert class_of_folder(name, "front3d_bedroom") == label
+    assert class_of_folder("spaceship", "void,spaceship") == "spaceship"
+
+
+def test_unknown_names_and_damaged_files_are_a_sentence_each(own):
+    (own / "sofaa").mkdir()
+    corner_sofa().export(own / "sofaa" / "one.obj")
+    (own / "sofa" / "cut.glb").write_bytes((own / "sofa" / "plain.GLB").read_bytes()[:300])
+    (own / "sofa" / "none.obj").write_text("v 0 0 0\n")
+    with pytest.warns(InputWarning) as told:
+        models = opened(own)
+    (said,) = [str(each.message) for each in told if issubclass(each.category, InputWarning)]
+    assert said.startswith(f"{own / 'sofaa'} is left out, with 1 models: its name is neither")
+    assert set(models.broken) == {"sofa/cut.glb", "sofa/none.obj"}
+    assert models.broken["sofa/cut.glb"].startswith("sofa/cut.glb cannot be read (")
+    assert models.broken["sofa/none.obj"] == "sofa/none.obj holds no usable triangles"
+    assert "\n" not in models.broken["sofa/cut.glb"]
+
+
+def test_folders_without_a_usable_model_are_sentences(folder, own, tmp_path):
+    (tmp_path / "empty").mkdir()
+    for name, given, label_set in (
+        ("missing", tmp_path / "none", "front3d_bedroom"),
+        ("empty", tmp_path / "empty", "front3d_bedroom"),
+        ("future", folder, "void,spaceship"),
+        ("own", own, "void,spaceship"),
+    ):
+        with refused(f"apps/models_{name}", tmp=tmp_path):
+            opened(given, label_set=label_set)

@@ -13,9 +13,7 @@ from sceneprior.apps.retrieval.retrieve import with_models
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.core.scene_json import scene_to_json
 from sceneprior.furniture.catalog import furniture_classes, make_variants
-from sceneprior.interchange.export import export_scenes
 from sceneprior.render.appearance import box_mesh
-from sceneprior.render.scene_files import load_scene, save
 
 
 def closed(mesh: Mesh) -> bool:
@@ -98,22 +96,3 @@ def test_a_completed_room_keeps_what_was_given():
     assert [found and found["model_id"][:-3] for found in room.extra["retrieval"]] == [
         None, "nightstand",
     ]  # fmt: skip
-
-
-def test_files_hold_the_models_and_simulators_get_them(prior, tmp_path):
-    pytest.importorskip("coacd", reason="the extra `sim` is not installed")
-    mujoco = pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
-    (room,) = prior.sample(seed=1, cad=True)
-    room = replace(room, objects=room.objects[:3])
-    for ending in (".glb", ".json"):
-        save(room, tmp_path / f"room{ending}")
-    read = load_scene(tmp_path / "room.json")
-    assert all(closed(item.mesh) for item in read.objects)
-    assert [item.turned.yaw_rad for item in read.objects] == pytest.approx(
-        [item.turned.yaw_rad for item in room.objects]
-    )
-    export_scenes([read], "mujoco", tmp_path / "mujoco")
-    model = mujoco.MjModel.from_xml_path(str(tmp_path / "mujoco" / f"{read.name}.xml"))
-    assert model.nmesh >= len(read.objects)
-    export_scenes([read], "habitat", tmp_path / "habitat")
-    assert len(list((tmp_path / "habitat" / "objects").glob("*.collider.glb"))) == 3

@@ -14,7 +14,6 @@ from sceneprior.apps.retrieval.retrieve import (
     placed,
     retrieval_report,
     retrieve,
-    retrieve_all,
 )
 from sceneprior.core.scene import Mesh, Scene, SceneObject, Turned, bound_m, quarter_turned
 from sceneprior.core.surfaces import surface_points
@@ -86,15 +85,6 @@ def test_a_model_in_disguise_is_found_with_its_turn(models, turn, size):
     assert best.distance_m < 0.15  # two samples of one surface
     made = retrieve(room(replace(item, mesh=mesh)), models)
     np.testing.assert_allclose(made.objects[0].mesh.vertices_m, mesh.vertices_m)
-
-
-def test_turns_are_yaws():
-    """docs/conventions.md: a yaw of 90 degrees turns +z towards +x."""
-    unit = Mesh(np.array([[0, 0, 0.5]]), np.zeros((0, 3), np.int64))
-    item = SceneObject("sofa", (0.0, 0.0, 0.0), (2.0, 1.0, 4.0))
-    np.testing.assert_allclose(placed(unit, item, 0).vertices_m[0], [0, 0, 2])
-    np.testing.assert_allclose(placed(unit, item, 90).vertices_m[0], [1, 0, 0], atol=1e-12)
-    np.testing.assert_allclose(placed(unit, item, 270).vertices_m[0], [-1, 0, 0], atol=1e-12)
 
 
 def random_furniture(rng):
@@ -182,15 +172,3 @@ def test_a_known_yaw_decides_between_turns_that_fit_alike():
     for turned in (quarter_turned(size, 3), Turned(0.3, (0.8, 1.0, 0.8)), None):
         best = most_similar(replace(sofa, turned=turned), models.by_class["sofa"])
         assert best.turn_deg == 90
-
-
-def test_many_scenes_are_the_same_as_one_by_one(models, rng):
-    scenes = [
-        replace(
-            room(SceneObject("sofa", (0.0, 0.4, 0.0), tuple(rng.uniform(0.3, 2, 3)))), name=str(k)
-        )
-        for k in range(6)
-    ]
-    many = list(retrieve_all(scenes, models))
-    assert [scene.name for scene in many] == [str(k) for k in range(6)]
-    assert [m.extra for m in many] == [retrieve(scene, models).extra for scene in scenes]
