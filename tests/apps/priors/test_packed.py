@@ -1,6 +1,6 @@
 """Packed priors: the same rooms to the bit; what is damaged or hostile is a sentence."""
 
-import io
+import hashlib
 import json
 import pickle
 import shutil
@@ -10,8 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from golden_values import assert_as_before
+from refusals import refused
 from safetensors.torch import load, save
-from tiny_runs import tiny_baseline
+from tiny_runs import tiny_baseline, tiny_config
 
 from sceneprior.apps.config import load_any_run, load_config, load_run
 from sceneprior.apps.priors.packed import (
@@ -28,7 +30,6 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.lifted.complete import complete
 from sceneprior.paper.interpolate import interpolate
-from sceneprior.training.fit import fit
 
 pytestmark = pytest.mark.usefixtures("few_attempts")
 BED = SceneObject("double_bed", (0.2, 0.3, -0.9), (1.7, 0.6, 2.1))
@@ -96,10 +97,28 @@ def test_with_latents_it_is_the_run_itself(toy_run, tmp_path):
 
 @pytest.mark.parametrize("method", ["atiss", "sync2gen", "set_flow"])
 def test_methods_of_boxes_travel_too(method, toy_shards, tmp_path):
-    config = tiny_baseline(toy_shards, method)
-    fit(config, tmp_path / "run", trainer_options={"accelerator": "cpu"})
-    back = load_any_run(packed_file(tmp_path / "run", tmp_path / "a.prior"))
-    assert_same(sample_rooms(load_any_run(tmp_path / "run"), 3, 1), sample_rooms(back, 3, 1))
+    config = tiny_baseline(toy_shards, method).with_label_set()
+    stage = config.stage_names[-1]
+    trained = config.trained(config.networks(stage, 0), stage, ("a", "b"))
+    write_packed(pack(trained, "# a card"), tmp_path / "a.prior")
+    assert_same(sample_rooms(trained, 3, 1), sample_rooms(load_any_run(tmp_path / "a.prior"), 3, 1))
+
+
+@pytest.mark.parametrize("options", [{}, {"latents": True}], ids=str)
+def test_a_packed_file_has_the_same_bytes_as_before(tmp_path, options):
+    """Weights are counted up, so that they do not depend on a processor."""
+    config = tiny_config("some/shards").with_label_set()
+    networks = config.networks("shape", 3)
+    for number, tensor in enumerate(networks.state_dict().values()):
+        values = torch.arange(tensor.numel()).reshape(tensor.shape) % 97 / 8 + number
+        tensor.copy_(values.to(tensor.dtype))
+    trained = config.trained(networks, "shape", ("a", "b", "c"))
+    write_packed(pack(trained, "# a card", **options), tmp_path / "a.prior")
+    with zipfile.ZipFile(tmp_path / "a.prior") as archive:
+        contents = {name: archive.read(name) for name in archive.namelist()}
+    assert tuple(contents) == FILES
+    found = {name: hashlib.sha256(content).hexdigest()[:16] for name, content in contents.items()}
+    assert_as_before(f"apps/packed_{'_'.join(options) or 'plain'}", found)
 
 
 def test_half_precision_is_smaller_and_nearly_the_same(
@@ -148,13 +167,6 @@ def test_networks_have_the_same_shapes_without_memory(path):
 # -- Damaged and hostile files ---------------------------------------------------------------------
 
 
-def refused(path: Path) -> str:
-    with pytest.raises(InputError) as error:
-        load_any_run(path)
-    assert "\n" not in str(error.value) and len(str(error.value)) > 40
-    return str(error.value)
-
-
 def rewritten(path: Path, target: Path, **changed: bytes | None) -> Path:
     """The same file with some of its files' contents exchanged, or left out."""
     names = {"card": CARD, "config": CONFIG, "weights": WEIGHTS}
@@ -166,14 +178,15 @@ def rewritten(path: Path, target: Path, **changed: bytes | None) -> Path:
     return target
 
 
-def described(path: Path) -> dict:
+def contents(path: Path, name: str) -> bytes:
     with zipfile.ZipFile(path) as archive:
-        return json.loads(archive.read(CONFIG))
+        return archive.read(name)
 
 
-def tensors_of(path: Path) -> dict[str, torch.Tensor]:
-    with zipfile.ZipFile(path) as archive:
-        return load(archive.read(WEIGHTS))
+def assert_refused(path: Path, what: str | None = None) -> None:
+    with pytest.raises(InputError, match=what) as error:
+        load_any_run(path)
+    assert "\n" not in str(error.value) and len(str(error.value)) > 40
 
 
 def test_pickles_and_checkpoints_are_refused_unopened(sampler_run, sampler_file, tmp_path):
@@ -183,17 +196,18 @@ def test_pickles_and_checkpoints_are_refused_unopened(sampler_run, sampler_file,
 
     path = tmp_path / "a.prior"
     path.write_bytes(pickle.dumps(Bomb()))
-    assert "is not a packed prior" in refused(path)
-    refused(rewritten(sampler_file, path, weights=pickle.dumps(Bomb())))
-    refused(rewritten(sampler_file, path, config=pickle.dumps(Bomb())))
+    assert_refused(path, "is not a packed prior")
+    assert_refused(rewritten(sampler_file, path, weights=pickle.dumps(Bomb())))
+    assert_refused(rewritten(sampler_file, path, config=pickle.dumps(Bomb())))
     shutil.copy(sampler_run / "sampler" / "final.ckpt", path)  # a zip, too
-    assert "is not a packed prior" in refused(path)
+    assert_refused(path, "is not a packed prior")
     assert not (tmp_path / "ran").exists()
 
 
-def test_what_claims_to_be_huge_is_refused_before_it_is_read(sampler_file, tmp_path, monkeypatch):
-    monkeypatch.setattr("sceneprior.apps.priors.packed.LARGEST", {n: 10_000 for n in FILES})
-    assert "model.safetensors has more than 10000 bytes" in refused(sampler_file)
+def test_large_files_are_refused_before_they_are_read(sampler_file, tmp_path, monkeypatch):
+    monkeypatch.setattr("sceneprior.apps.priors.packed.LARGEST", dict.fromkeys(FILES, 10_000))
+    with refused("apps/prior_large", tmp=sampler_file.parent):
+        load_any_run(sampler_file)
 
 
 @pytest.mark.parametrize(
@@ -207,54 +221,56 @@ def test_what_claims_to_be_huge_is_refused_before_it_is_read(sampler_file, tmp_p
 def test_settings_that_ask_for_other_networks_are_sentences(
     sampler_file, tmp_path, section, key, value
 ):
-    data = described(sampler_file)
+    data = json.loads(contents(sampler_file, CONFIG))
     data["settings"][section][key] = value
     content = json.dumps(data).encode()
-    refused(rewritten(sampler_file, tmp_path / "a.prior", config=content))
+    assert_refused(rewritten(sampler_file, tmp_path / "a.prior", config=content))
 
 
-@pytest.mark.parametrize(
-    ("change", "sentence"),
-    [
-        ({"format": "other"}, "it says format 'other' version 1, not 'sceneprior-prior'"),
-        ({"version": 2}, "version 2, not 'sceneprior-prior' version 1"),
-        ({"stage": "nothing"}, "no stage of its method is called 'nothing'"),
-        ({"stage": "shape"}, "its weights do not match its settings"),
-        ({"stage": ["shape"]}, "'stage': input should be a valid string"),
-        ({"classes": ["void", "throne"]}, "its classes are not those of front3d_bedroom"),
-        ({"room_ids": ["a", "b"]}, "latents.weight and 0 others do not fit"),
-        ({"settings": 3}, "'settings': input should be a valid dictionary"),
-        ({"settings": {"method": "magic"}}, "no method is called 'magic'"),
-    ],
-)
-def test_descriptions_that_are_wrong_say_what_is(sampler_file, tmp_path, change, sentence):
-    content = json.dumps(described(sampler_file) | change).encode()
-    path = rewritten(sampler_file, tmp_path / "a.prior", config=content)
-    assert sentence in refused(path)
+DESCRIPTIONS = {
+    "format": {"format": "other"},
+    "version": {"version": 2},
+    "no_stage": {"stage": "nothing"},
+    "stage_type": {"stage": ["shape"]},
+    "classes": {"classes": ["void", "throne"]},
+    "room_ids": {"room_ids": ["a", "b"]},
+    "settings": {"settings": 3},
+    "method": {"settings": {"method": "magic"}},
+}
 
 
-def test_numbers_that_are_none_and_classes_that_are_not_there(sampler_file, tmp_path):
-    tensors = tensors_of(sampler_file)
-    name = "prior.layout.mlp1.0.weight"
-    broken = tensors | {name: torch.full_like(tensors[name], torch.nan)}
-    path = rewritten(sampler_file, tmp_path / "a.prior", weights=save(broken))
-    assert f"{name} holds numbers that are not finite" in refused(path)
-    name = "sampler.look_class"
-    broken = tensors | {name: torch.full_like(tensors[name], 99)}
-    path = rewritten(sampler_file, tmp_path / "b.prior", weights=save(broken))
-    assert f"{name} holds class indices out of range" in refused(path)
-    del tensors[name]
-    path = rewritten(sampler_file, tmp_path / "c.prior", weights=save(tensors))
-    assert "sampler.look_class and 0 others do not fit" in refused(path)
+@pytest.mark.parametrize("name", DESCRIPTIONS)
+def test_descriptions_that_are_wrong_say_what_is(sampler_file, tmp_path, name):
+    said = json.loads(contents(sampler_file, CONFIG)) | DESCRIPTIONS[name]
+    path = rewritten(sampler_file, tmp_path / "a.prior", config=json.dumps(said).encode())
+    with refused(f"apps/prior_{name}", tmp=tmp_path):
+        load_any_run(path)
+
+
+def test_wrong_numbers_and_classes_are_refused(sampler_file, tmp_path):
+    tensors = load(contents(sampler_file, WEIGHTS))
+    weight = "prior.layout.mlp1.0.weight"
+    label = next(name for name in tensors if name.endswith("_class"))
+    changes = {
+        "nan": tensors | {weight: torch.full_like(tensors[weight], torch.nan)},
+        "unknown_class": tensors | {label: torch.full_like(tensors[label], 99)},
+        "missing_tensor": {name: value for name, value in tensors.items() if name != label},
+    }
+    for name, changed in changes.items():
+        path = rewritten(sampler_file, tmp_path / f"{name}.prior", weights=save(changed))
+        with refused(f"apps/prior_{name}", tmp=tmp_path, label=label):
+            load_any_run(path)
 
 
 def test_other_zips_and_folders_are_sentences(sampler_file, tmp_path):
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
+    with zipfile.ZipFile(tmp_path / "a.prior", "w") as archive:
         archive.writestr("notes.txt", "hello")
-    (tmp_path / "a.prior").write_bytes(buffer.getvalue())
-    assert "no item named 'README.md'" in refused(tmp_path / "a.prior")
-    assert "is not a run folder" in refused(tmp_path)
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / WEIGHTS).write_bytes(b"")
-    assert "is not a packed prior" in refused(tmp_path / "folder")
+    for name, path in (
+        ("other_zip", tmp_path / "a.prior"),
+        ("no_run", tmp_path),
+        ("empty_folder", tmp_path / "folder"),
+    ):
+        with refused(f"apps/prior_{name}", tmp=tmp_path):
+            load_any_run(path)

@@ -2,17 +2,32 @@
 
 import hashlib
 import json
+import shutil
+import sys
 import zipfile
+from pathlib import Path
 
 import pytest
 import torch
+from golden_values import assert_as_before
+from refusals import refused
 
 import sceneprior
-from sceneprior.apps.priors.packed import FILES, read_packed, shipped_priors
+from sceneprior.apps.config import load_any_run
+from sceneprior.apps.priors.packed import (
+    FILES,
+    find_prior,
+    pack,
+    read_packed,
+    shipped_priors,
+    write_packed,
+)
+from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.errors import InputError
 from sceneprior.render.scene_files import save
 
 SHIPPED = shipped_priors()
+COMMIT = "0123456789abcdef0123456789abcdef01234567"
 
 
 @pytest.fixture(params=SHIPPED)
@@ -91,3 +106,77 @@ def test_their_cards_credit_the_data_and_say_how_they_were_made_and_how_good_the
     assert "| Category KL to test rooms" in card and "real test (" in card
     if name.startswith("procthor"):
         assert "ProcTHOR" in card and "Sweet Home 3D" in card and "CC-BY-3.0" in card
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:16]
+
+
+def test_shipped_priors_hold_the_same_weights():
+    """Whatever the names of tensors, which may change."""
+    found = {}
+    for name, path in shipped_priors().items():
+        trained, said = load_any_run(name), read_packed(path).said
+        networks = {"prior": trained.prior, "sampler": trained.sampler}
+        tensors = [t for n in networks.values() for t in n.state_dict().values()]
+        hashes = sorted(
+            _digest(t.contiguous().numpy().tobytes()) for t in [*tensors, trained.logits]
+        )
+        found[name] = [trained.stage, said.training_rooms, len(said.room_ids), len(hashes),
+                       _digest("".join(hashes).encode())]  # fmt: skip
+    assert_as_before("apps/shipped_weights", found)
+
+
+# -- Finding them ----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def hub(tmp_path, monkeypatch):
+    """A cache of the Hub without a network, which holds nothing yet."""
+    constants = pytest.importorskip("huggingface_hub.constants")
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    return tmp_path / "cache"
+
+
+def test_a_repository_of_the_hub_is_a_prior(hub, sampler_run, tmp_path, few_attempts):
+    """The repository is stored as the Hub's own client does: by commit, with the name of the
+    branch."""
+    trained = load_any_run(sampler_run)
+    write_packed(pack(trained, "# a card"), tmp_path / "a.prior")
+    repository = hub / "models--someone--bedrooms"
+    with zipfile.ZipFile(tmp_path / "a.prior") as archive:
+        archive.extractall(repository / "snapshots" / COMMIT)
+    (repository / "refs").mkdir()
+    (repository / "refs" / "main").write_text(COMMIT)
+    found = find_prior("hf://someone/bedrooms")
+    assert {path.name for path in found.iterdir()} == set(FILES)
+    one, other = (
+        [item.center_m for room in sample_rooms(run, 8, 0) for item in room.objects]
+        for run in (trained, load_any_run("hf://someone/bedrooms"))
+    )
+    assert one == other and one
+
+
+def test_what_the_hub_does_not_give_is_one_sentence(hub):
+    for name in ("hf://someone/else", "hf://", "hf://a/b/c", "hf://no spaces/here"):
+        with pytest.raises(InputError) as error:
+            find_prior(name)
+        assert str(error.value).startswith(f"{name} cannot be fetched (")
+        assert "\n" not in str(error.value) and "HF_TOKEN" in str(error.value)
+
+
+def test_without_the_hub_s_client_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
+    with refused("apps/prior_no_hub"):
+        find_prior("hf://someone/bedrooms")
+
+
+def test_paths_come_before_names(tmp_path, monkeypatch):
+    name = next(iter(shipped_priors()))
+    assert find_prior(name) == shipped_priors()[name]
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(shipped_priors()[name], tmp_path / name)
+    assert find_prior(name) == Path(name)
+    with refused("apps/prior_missing"):
+        find_prior("nothing")

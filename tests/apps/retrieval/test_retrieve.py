@@ -97,8 +97,8 @@ def random_furniture(rng):
 
 
 def test_the_fast_search_finds_the_winner_of_the_slow_one(rng):
-    models = cad_models(1024, sofa={f"m{k:02d}": random_furniture(rng) for k in range(80)})
-    for _ in range(3):
+    models = cad_models(1024, sofa={f"m{k:02d}": random_furniture(rng) for k in range(40)})
+    for _ in range(2):
         size = tuple(rng.uniform(0.4, 2.2, 3))
         like = random_furniture(rng)
         item = SceneObject("sofa", (0.0, size[1] / 2, 0.0), size)
