@@ -40,12 +40,12 @@ MAY_TOO = {
 
 BUDGET = {
     "data_prep": (13743, 110),
-    "sceneprior/core": (5937, 35),
+    "sceneprior/core": (5897, 35),
     "sceneprior/furniture": (586, 4),
     "sceneprior/render": (4596, 36),
     "sceneprior/training": (929, 9),
     "sceneprior/paper": (2710, 24),
-    "sceneprior/lifted": (8874, 68),
+    "sceneprior/lifted": (8880, 68),
     "sceneprior/baselines": (3103, 28),
     "sceneprior/evaluation": (4840, 38),
     "sceneprior/interchange": (1000, 9),

@@ -1,4 +1,4 @@
-"""Batches of rooms: `SceneViews`, `LiftedRooms`, `DecodedScenes`, `RoomBoxes`."""
+"""Batches of rooms: their views, decoded scenes, and labelled boxes."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int, Integer
 from torch import Tensor
 
 _B = TypeVar("_B", bound="Batch")
+_Rooms = TypeVar("_Rooms", bound="RoomBoxes")
 
 
 @dataclass(frozen=True)
@@ -92,40 +93,8 @@ class DecodedScenes:
     """Bevels of the proxy `beveled_box` (`beveled_cube` in `core/meshes.py`); None for
     rooms that were not decoded by a prior."""
     vertices_m: Float[Tensor, "rooms objects vertices 3"] | None = None
-    """Mesh vertices in the room frame; None before the shape decoder has run, and if it predicts
-    `looks`."""
-    shape_codes: Float[Tensor, "rooms objects codes"] | None = None
-    """Predicted shape codes (`lifted/prototype_decoder.py`); None if shapes are deformed meshes."""
-    looks: Int[Tensor, "rooms objects"] | None = None
-    """Look of each object, that is, its prototype and pose as one index: prototype * 8 + pose
-    (`lifted/prototypes.py`). None before the shape decoder has run, and if it predicts meshes."""
-    next_looks: Int[Tensor, "rooms objects"] | None = None
-    """Look into which each object changes along a path; None if the room is not on a path."""
-    shares: Float[Tensor, "rooms objects"] | None = None
-    """Share of `next_looks` in each object's shape, at least 0 and less than 1."""
-
-
-@dataclass(frozen=True)
-class LiftedRooms(Batch):
-    """Tracked objects of a batch of rooms, lifted to 3D from masks alone (`lifted/lifting`).
-
-    Objects are padded to the largest room's count.
-    """
-
-    room_index: Int[Tensor, " rooms"]
-    """Row of each room in the data set, which is also the row of its latent vector."""
-    object_class: Int[Tensor, "rooms objects"]
-    """Index into the label set; 0 where `is_object` is false."""
-    is_object: Bool[Tensor, "rooms objects"]
-    """False for padding; the first n entries of a room with n tracked objects are true."""
-    is_lifted: Bool[Tensor, "rooms objects"]
-    """True if the object's box is known, because some view shows the object."""
-    boxes_m: Float[Tensor, "rooms objects 6"]
-    """Axis-aligned boxes in the room frame: centre x, y, z, then full extents."""
-    looks: Int[Tensor, "rooms objects"] | None = None
-    """Look (prototype * 8 + pose) nearest to the lifted shape (`lifted/prototypes.py`); -1 if there
-    is none."""
-    room_ids: tuple[str, ...] = ()
+    """Mesh vertices in the room frame; None before the shape decoder has run, and for
+    methods without meshes."""
 
 
 @dataclass(frozen=True)
@@ -146,34 +115,25 @@ class RoomBoxes(Batch):
     room_ids: tuple[str, ...] = ()
     yaw_rad: Float[Tensor, "rooms objects"] | None = None
     """Rotation about +y that takes +z to each piece's front, in [-pi, pi]; None if unknown."""
-    looks: Int[Tensor, "rooms objects"] | None = None
-    """Look of each object, prototype * 8 + pose (`lifted/prototypes.py`); None if unknown."""
-    rectangle_m: Float[Tensor, "rooms 4"] | None = None
-    """Rectangle in which each room was furnished: centre x, z and extents x, z; None if unknown."""
-    walls_m: Float[Tensor, "rooms 4"] | None = None
-    """Distances of the walls near the furniture from the origin, outwards, at low z, low x, high z
-    and high x; NaN where no wall is known. None if no walls are known."""
 
-    def split(self, rooms: int) -> list["RoomBoxes"]:
+    def split(self: _Rooms, rooms: int) -> list[_Rooms]:
         """Split into batches of at most `rooms` rooms, without ids."""
 
-        def batch(start: int) -> "RoomBoxes":
+        def batch(start: int) -> _Rooms:
             part = self.changed(lambda tensor: tensor[start : start + rooms])
             return replace(part, room_ids=())
 
         return [batch(start) for start in range(0, len(self.is_object), rooms)]
 
-    def only(self, here: Bool[Tensor, "rooms objects"]) -> "RoomBoxes":
+    def only(self: _Rooms, here: Bool[Tensor, "rooms objects"]) -> _Rooms:
         """Copy that keeps the objects where `here` is true; the other slots become padding."""
         return replace(self, object_class=self.object_class * here, is_object=self.is_object & here)
 
-    def take(self, order: Int[Tensor, "rooms slots"]) -> "RoomBoxes":
+    def take(self: _Rooms, order: Int[Tensor, "rooms slots"]) -> _Rooms:
         """Gather the slots of each room in the order of the indices `order`."""
 
         def taken(tensor: Tensor) -> Tensor:
             rows = order if tensor.ndim == 2 else order.unsqueeze(-1)
             return torch.take_along_dim(tensor, rows, dim=1)
 
-        # Rectangles and walls have no slots.
-        slots = replace(self, rectangle_m=None, walls_m=None).changed(taken)
-        return replace(slots, rectangle_m=self.rectangle_m, walls_m=self.walls_m)
+        return self.changed(taken)

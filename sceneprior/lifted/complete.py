@@ -26,9 +26,10 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.repeatable import check_seed
 from sceneprior.core.scene import Scene
 from sceneprior.core.scene_json import check_box
-from sceneprior.core.views import DecodedScenes, RoomBoxes
+from sceneprior.core.views import DecodedScenes
 from sceneprior.lifted.config import TrainedLifted
 from sceneprior.lifted.insert import insert
+from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampled import class_rows, drawn_by_sampler, floor_rectangle, sample_scenes
 from sceneprior.lifted.sampler.plan import Given
 from sceneprior.paper.decode import decode_latents
@@ -103,7 +104,7 @@ def complete(
 def _drawn(
     trained: TrainedLifted,
     scenes: Sequence[Scene],
-    given: RoomBoxes,
+    given: PosedRooms,
     names: Sequence[str],
     seed: int,
     classes: Sequence[str] | None,
@@ -140,7 +141,7 @@ def _with_no_place(room: Scene, classes: Sequence[str]) -> Scene:
     return replace(room, extra={**room.extra, "no_place": lacking})
 
 
-def gather_given(trained: TrainedPrior, scenes: Sequence[Scene]) -> RoomBoxes:
+def gather_given(trained: TrainedPrior, scenes: Sequence[Scene]) -> PosedRooms:
     """Given objects as tensors.
 
     Raises:
@@ -167,17 +168,17 @@ def gather_given(trained: TrainedPrior, scenes: Sequence[Scene]) -> RoomBoxes:
             check_box(scene.name, item.label, item.center_m, item.size_m)
             labels[row, column] = names.index(item.label)
             boxes_m[row, column] = torch.tensor([*item.center_m, *item.size_m])
-    return RoomBoxes(labels, is_object, boxes_m)
+    return PosedRooms(labels, is_object, boxes_m)
 
 
-def repeated(rooms: RoomBoxes, times: int) -> RoomBoxes:
+def repeated(rooms: PosedRooms, times: int) -> PosedRooms:
     """Each room repeated `times` times in a row."""
     return rooms.changed(lambda tensor: tensor.repeat_interleave(times, dim=0))
 
 
 @torch.no_grad()
 def _starts(
-    trained: TrainedPrior, given: RoomBoxes, each: int, seed: int, distribution: str | None
+    trained: TrainedPrior, given: PosedRooms, each: int, seed: int, distribution: str | None
 ) -> Float[Tensor, "starts dimension"]:
     """Choose `each` starting latents for every room, best first: the sampled latents whose decoded
     rooms have the lowest `given_loss`."""
@@ -191,7 +192,7 @@ def _starts(
 def fit_latents_to_objects(
     trained: TrainedPrior,
     starts: Float[Tensor, "rooms dimension"],
-    given: RoomBoxes,
+    given: PosedRooms,
     steps: int = STEPS,
 ) -> tuple[Float[Tensor, "rooms dimension"], Float[Tensor, " rooms"]]:
     """Optimise latents until their rooms hold the given objects; return them and their final
@@ -220,7 +221,7 @@ def fit_latents_to_objects(
 
 
 def given_loss(
-    decoded: DecodedScenes, given: RoomBoxes, completeness_target: str = "first_n"
+    decoded: DecodedScenes, given: PosedRooms, completeness_target: str = "first_n"
 ) -> Float[Tensor, " rooms"]:
     """Loss of decoded rooms, averaged over the given objects; 0 if there are none.
 

@@ -13,7 +13,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from sceneprior.core.settings import Section
-from sceneprior.core.views import DecodedScenes, LiftedRooms
+from sceneprior.core.views import DecodedScenes
+from sceneprior.lifted.rooms import LiftedRooms, PosedScenes
 from sceneprior.paper.losses import class_loss, completeness_targets, mean_of_objects, take
 from sceneprior.paper.matching import Matches, assign, class_cost
 
@@ -109,7 +110,7 @@ def shape_code_loss(
     a cord, which fills a hundredth of its box, would hardly be learnt. `codes` holds a_j and
     `cells` cells_j, from the objects' looks (`PrototypeDecoder.targets`).
     """
-    assert scenes.shape_codes is not None, "the prior decodes looks"
+    assert isinstance(scenes, PosedScenes) and scenes.shape_codes is not None
     apart = take(scenes.shape_codes, matches.prediction, dim=1) - codes
     return mean_of_objects(apart.square().sum(dim=-1) / cells, matches.valid)
 

@@ -32,6 +32,7 @@ from sceneprior.lifted.prototypes import (
     turn_of,
     turned_extents,
 )
+from sceneprior.lifted.rooms import PosedScenes
 from sceneprior.lifted.shape_morphing import (
     appearances_of,
     pose_rotation,
@@ -184,7 +185,7 @@ class PrototypeDecoder(ShapeModule):
         them."""
         codes = self(features).to(scenes.centers_m.dtype)
         looks = None if with_shape is False else self.looks(codes)
-        return replace(scenes, shape_codes=codes, looks=looks)
+        return PosedScenes.of(scenes, shape_codes=codes, looks=looks)
 
     def along_path(
         self,
@@ -193,6 +194,8 @@ class PrototypeDecoder(ShapeModule):
         path: DecodedScenes,
         kept: Bool[Tensor, "steps objects"],
     ) -> DecodedScenes:
+        if not (isinstance(rooms, PosedScenes) and isinstance(path, PosedScenes)):
+            return rooms
         if rooms.looks is None or path.looks is None:
             return rooms
         looks, next_looks = rooms.looks.clone(), rooms.looks.clone()
@@ -205,7 +208,7 @@ class PrototypeDecoder(ShapeModule):
         return replace(rooms, looks=looks, next_looks=next_looks, shares=shares)
 
     def mesh_of(self, decoded: DecodedScenes, room: int, item: int) -> Mesh | None:
-        if decoded.looks is None:
+        if not isinstance(decoded, PosedScenes) or decoded.looks is None:
             return None
         box_m, blend = _box_m(decoded, room, item), self._blend(decoded, room, item)
         if blend is None:
@@ -214,14 +217,14 @@ class PrototypeDecoder(ShapeModule):
         return Mesh(vertices * box_m[3:] + box_m[:3], faces)
 
     def solids_of(self, decoded: DecodedScenes, room: int, item: int) -> tuple[Solid, ...]:
-        if decoded.looks is None:
+        if not isinstance(decoded, PosedScenes) or decoded.looks is None:
             return ()
         box_m, blend = _box_m(decoded, room, item), self._blend(decoded, room, item)
         if blend is None:
             return self.solids(int(decoded.looks[room, item]), box_m)
         return _solids_in(blend, box_m)
 
-    def _blend(self, decoded: DecodedScenes, room: int, item: int) -> Parts | None:
+    def _blend(self, decoded: PosedScenes, room: int, item: int) -> Parts | None:
         """The parts of a shape between two looks, in the frame of its box; None if the prediction
         has one look."""
         if decoded.shares is None or not (share := float(decoded.shares[room, item])):

@@ -12,11 +12,11 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.outline import rectangle
 from sceneprior.core.repeatable import single_threaded
 from sceneprior.core.scene import Mesh, Scene, SceneObject, Solid, quarter_turned
-from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.config import SAMPLER, TrainedLifted
 from sceneprior.lifted.lifting import HANGS_M
 from sceneprior.lifted.prototype_decoder import PrototypeDecoder
 from sceneprior.lifted.prototypes import POSES
+from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.draw import draw_rooms
 from sceneprior.lifted.sampler.frames import side_of
 from sceneprior.lifted.sampler.plan import Given
@@ -51,7 +51,7 @@ def sample_scenes(
     return [scene_of(trained, name, rooms, row) for row, name in enumerate(names)]
 
 
-def scene_of(trained: TrainedLifted, name: str, rooms: RoomBoxes, row: int) -> Scene:
+def scene_of(trained: TrainedLifted, name: str, rooms: PosedRooms, row: int) -> Scene:
     """Convert a sampled room to a scene with meshes; its floor is the room's rectangle, if known.
 
     Yaws of objects are those of the fronts of their looks (`lifted/sampler/fronts.py`).

@@ -3,7 +3,6 @@
 import torch
 from torch import Tensor
 
-from sceneprior.core.views import LiftedRooms
 from sceneprior.lifted.lifting.dataset import LiftedDataset
 from sceneprior.lifted.losses import (
     LiftedLossConfig,
@@ -14,6 +13,7 @@ from sceneprior.lifted.losses import (
     shape_code_loss,
 )
 from sceneprior.lifted.prototype_decoder import PrototypeDecoder
+from sceneprior.lifted.rooms import LiftedRooms
 from sceneprior.paper.stages import LatentStage
 from sceneprior.training.steps import batch_seed, check_finite, full_precision
 

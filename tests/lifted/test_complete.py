@@ -11,7 +11,7 @@ from torch import nn
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene, SceneObject
-from sceneprior.core.views import DecodedScenes, RoomBoxes
+from sceneprior.core.views import DecodedScenes
 from sceneprior.lifted.complete import (
     BOX_WEIGHT,
     _starts,
@@ -22,6 +22,7 @@ from sceneprior.lifted.complete import (
     log_kept,
     repeated,
 )
+from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.paper.latents import LatentSphere
 from sceneprior.paper.losses import kept_objects
 from sceneprior.paper.prior import ScenePrior
@@ -60,7 +61,7 @@ def test_the_loss_is_its_definition(target):
     labels = torch.tensor([[1, 2, 4], [3, 0, 0], [0, 0, 0]])
     is_object = torch.tensor([[True] * 3, [True, False, False], [False] * 3])
     boxes = torch.randn(3, 3, 6, dtype=torch.float64)
-    losses = given_loss(decoded, RoomBoxes(labels, is_object, boxes), target)
+    losses = given_loss(decoded, PosedRooms(labels, is_object, boxes), target)
     for room in range(3):
         count = int(is_object[room].sum())
         expected = loss_in_words(decoded, room, labels[room, :count], boxes[room], target)

@@ -1,6 +1,5 @@
 """Lifted boxes as targets: the matching against all permutations, the terms against loops."""
 
-from dataclasses import replace
 from itertools import permutations
 
 import pytest
@@ -8,8 +7,9 @@ import torch
 from torch.nn import functional as F
 from torch.testing import assert_close
 
-from sceneprior.core.views import DecodedScenes, LiftedRooms
+from sceneprior.core.views import DecodedScenes
 from sceneprior.lifted.losses import PER_METRE, lifted_losses, match_lifted, shape_code_loss
+from sceneprior.lifted.rooms import LiftedRooms, PosedScenes
 
 COUNTS = (3, 2, 0)
 
@@ -102,7 +102,7 @@ def test_the_distance_of_codes_is_a_filled_cell_s(scenes, rooms, torch_rng):
         apart.append((codes[room, k] - wanted[room, item]).square().sum() / cells[room, item])
 
     def loss(codes):
-        return shape_code_loss(replace(scenes, shape_codes=codes), matches, wanted, cells)
+        return shape_code_loss(PosedScenes.of(scenes, shape_codes=codes), matches, wanted, cells)
 
     assert_close(loss(codes), torch.stack(apart).mean(), rtol=0, atol=1e-12)
     assert torch.autograd.gradcheck(loss, codes)

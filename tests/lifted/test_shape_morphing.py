@@ -10,6 +10,7 @@ from sceneprior.core.parts import Stretch, filled_cells, surface_of_parts
 from sceneprior.core.views import DecodedScenes
 from sceneprior.lifted.prototype_decoder import PrototypeConfig, PrototypeDecoder
 from sceneprior.lifted.prototypes import POSES, Prototypes, turned_extents
+from sceneprior.lifted.rooms import PosedScenes
 from sceneprior.lifted.shape_morphing import appearances_of, posed_parts, stretched_parts
 
 STEPS = 129
@@ -65,7 +66,7 @@ def test_parts_pose_and_stretch_as_the_mesh_of_their_look_does(decoder):
 def decoded(looks) -> DecodedScenes:
     """Rooms of one object, which has these looks."""
     rooms = len(looks)
-    return DecodedScenes(
+    return PosedScenes(
         torch.zeros(rooms, 1, 3), torch.zeros(rooms, 1, 3), torch.ones(rooms, 1, 3),
         torch.ones(rooms, 1), looks=torch.tensor(looks).unsqueeze(1),
     )  # fmt: skip

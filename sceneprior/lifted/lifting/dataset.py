@@ -16,11 +16,11 @@ from sceneprior.core.dataset import BLANK, RoomDataset, allowed_views
 from sceneprior.core.errors import ShardError
 from sceneprior.core.parts import filled_cells
 from sceneprior.core.shards import RoomViews, Shard
-from sceneprior.core.views import LiftedRooms
 from sceneprior.core.wall_lines import Wall
 from sceneprior.lifted.lifting import HANGS_M, RayPool, ShapeGrid
 from sceneprior.lifted.lifting.cache import LiftedCache, fingerprint
 from sceneprior.lifted.prototypes import Prototypes, choose_prototypes, turn_posed
+from sceneprior.lifted.rooms import LiftedRooms
 
 
 class LiftedDataset(RoomDataset):

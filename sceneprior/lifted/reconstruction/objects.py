@@ -24,6 +24,7 @@ from sceneprior.core.views import DecodedScenes
 from sceneprior.lifted.prototype_decoder import PrototypeDecoder
 from sceneprior.lifted.reconstruction.known_rooms import turn_object
 from sceneprior.lifted.reconstruction.placing import Outlines, Placed, outlines_of, place_objects
+from sceneprior.lifted.rooms import PosedScenes
 from sceneprior.paper.decode import scene_of
 from sceneprior.paper.losses import kept_objects
 from sceneprior.paper.prior import ScenePrior, TrainedPrior
@@ -291,7 +292,8 @@ def _furthest(
         away = decoded.vertices_m[row, slot] - decoded.centers_m[row, slot].unsqueeze(1)
         surfaces = list(away / sizes_m.unsqueeze(1))
     else:
-        assert decoded.looks is not None and isinstance(prior.shape, PrototypeDecoder)
+        assert isinstance(decoded, PosedScenes) and decoded.looks is not None
+        assert isinstance(prior.shape, PrototypeDecoder)
         meshes = [prior.shape.mesh(look, UNIT_BOX) for look in decoded.looks[row, slot].tolist()]
         surfaces = [torch.from_numpy(mesh.vertices_m).to(directions) for mesh in meshes]
     return torch.stack([each[(each @ directions.T).argmax(dim=0)] for each in surfaces])

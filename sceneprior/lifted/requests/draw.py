@@ -9,7 +9,6 @@ import torch
 
 from sceneprior.core.colliders import HUNG
 from sceneprior.core.errors import InputError
-from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.requests.particles import PARTICLES, Particles, start_particles
 from sceneprior.lifted.requests.placement_rules import PlacementRules
 from sceneprior.lifted.requests.plans import RoomPlan, check_area, plan_room, warn_of_area
@@ -18,6 +17,7 @@ from sceneprior.lifted.requests.request import Request
 from sceneprior.lifted.requests.shape import RoomShape
 from sceneprior.lifted.requests.steps import Rejections, place_next
 from sceneprior.lifted.requests.wishes import RelationWish, check_wishes
+from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.draw import LOOKS, with_looks
 from sceneprior.lifted.sampler.network import RoomSampler
 from sceneprior.lifted.sampler.plan import Plan
@@ -36,7 +36,7 @@ class Answer:
     """A sampled room."""
 
     plan: RoomPlan
-    room: RoomBoxes
+    room: PosedRooms
     """The room, as a batch of one."""
     missing: tuple[int, ...] = ()
     """Classes of required objects that found no place."""
@@ -94,12 +94,12 @@ def draw_requested(
 
 def _given(
     sampler: RoomSampler, request: Request, classes: tuple[str, ...], seed: int
-) -> RoomBoxes:
+) -> PosedRooms:
     """The given objects as one room with looks."""
     objects = request.objects
     boxes_m = [[*item.center_m, *item.size_m] for item in objects]
     labels = torch.tensor([[classes.index(item.label) for item in objects]], dtype=torch.int64)
-    known = RoomBoxes(
+    known = PosedRooms(
         labels, torch.ones_like(labels, dtype=torch.bool),
         torch.tensor(boxes_m).float().reshape(1, -1, 6),
     )  # fmt: skip
@@ -117,7 +117,7 @@ def _given(
 def _furnish(
     sampler: RoomSampler,
     plans: Sequence[RoomPlan],
-    given: RoomBoxes,
+    given: PosedRooms,
     draws: Sequence[np.random.Generator],
     relations: Sequence[RelationWish],
     classes: tuple[str, ...],

@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
-from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.requests.plans import RoomPlan
+from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.draw import read_rooms
 from sceneprior.lifted.sampler.network import RoomSampler
 from sceneprior.lifted.sampler.reading import Reading
@@ -25,7 +25,7 @@ class Particles:
     r * `PARTICLES`."""
 
     plans: Sequence[RoomPlan]
-    rooms: RoomBoxes
+    rooms: PosedRooms
     number: Int[Tensor, " rows"]
     """Objects placed so far."""
     upcoming: Int[Tensor, "rows slots"]
@@ -76,7 +76,9 @@ class Particles:
         self.alive[dead] = True
 
 
-def start_particles(sampler: RoomSampler, plans: Sequence[RoomPlan], given: RoomBoxes) -> Particles:
+def start_particles(
+    sampler: RoomSampler, plans: Sequence[RoomPlan], given: PosedRooms
+) -> Particles:
     """Particles that contain the given objects alone.
 
     Args:

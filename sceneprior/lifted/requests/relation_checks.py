@@ -7,7 +7,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.requests.relations import (
     OPENINGS,
     OUTWARD,
@@ -18,6 +17,7 @@ from sceneprior.lifted.requests.relations import (
 )
 from sceneprior.lifted.requests.shape import RoomShape
 from sceneprior.lifted.requests.wishes import RelationWish
+from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.frames import side_of
 from sceneprior.lifted.sampler.network import RoomSampler
 
@@ -58,7 +58,7 @@ def furniture_of(
     return Furniture(boxes_m.double().numpy(), object_class.numpy(), back, front)
 
 
-def furniture_in(sampler: RoomSampler, rooms: RoomBoxes, row: int) -> Furniture:
+def furniture_in(sampler: RoomSampler, rooms: PosedRooms, row: int) -> Furniture:
     """The objects of a room in a batch."""
     assert rooms.looks is not None
     here = rooms.is_object[row]

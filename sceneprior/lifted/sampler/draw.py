@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from sceneprior.core.mixtures import draw_index
-from sceneprior.core.views import RoomBoxes
+from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.contents import END
 from sceneprior.lifted.sampler.network import RoomSampler
 from sceneprior.lifted.sampler.plan import (
@@ -50,7 +50,7 @@ SIDE_BY_SIDE = 32
 @torch.no_grad()
 def draw_rooms(
     sampler: RoomSampler, count: int, seed: int, given: Given | None = None
-) -> RoomBoxes:
+) -> PosedRooms:
     """Sample new rooms with looks and rectangles; given objects come first, with their own boxes.
 
     A room's contents are sampled first (`plan_rooms`), then its objects one by one, each at the
@@ -99,12 +99,12 @@ def _attempts(rooms: int) -> int:
     return max(1, SIDE_BY_SIDE // rooms)
 
 
-def _nothing_drawn(count: int, slots: int) -> RoomBoxes:
+def _nothing_drawn(count: int, slots: int) -> PosedRooms:
     none = torch.zeros(count, slots, dtype=torch.int64)
-    return RoomBoxes(none, none > 0, torch.zeros(count, slots, 6), looks=none.clone())
+    return PosedRooms(none, none > 0, torch.zeros(count, slots, 6), looks=none.clone())
 
 
-def _parts(rooms: RoomBoxes) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _parts(rooms: PosedRooms) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     assert rooms.looks is not None
     return rooms.object_class, rooms.is_object, rooms.boxes_m, rooms.looks
 
@@ -114,7 +114,7 @@ def _draw(
     uniform: Float[Tensor, "rooms slots numbers"],
     plan: Plan,
     last: bool,
-) -> tuple[RoomBoxes, Bool[Tensor, " rooms"]]:
+) -> tuple[PosedRooms, Bool[Tensor, " rooms"]]:
     """Furnish rooms once; also return a mask of the rooms to furnish again, because some object
     found no place, or a side of a sampled rectangle stays empty.
     """
@@ -147,7 +147,7 @@ def _draw(
 
 def read_rooms(
     sampler: RoomSampler,
-    rooms: RoomBoxes,
+    rooms: PosedRooms,
     number: Int[Tensor, " rooms"],
     rectangle_m: Float[Tensor, "rooms 4"],
     coming: Int[Tensor, "rooms wanted"],
@@ -202,7 +202,7 @@ def with_looks(
     sampler: RoomSampler,
     uniform: Float[Tensor, "rooms slots numbers"],
     plan: Plan,
-) -> RoomBoxes:
+) -> PosedRooms:
     """The given objects, in as many slots as rooms have, each with a look: `LOOKS` looks are
     sampled by their likelihood and that of the size, then one of them by the likelihood of the
     place."""
@@ -211,7 +211,7 @@ def with_looks(
     still = torch.cat([objects.object_class * objects.is_object, plan.coming], dim=1)
     empty = (0, sampler.max_objects - known)
     looks = torch.zeros(count, sampler.max_objects, dtype=torch.int64)
-    rooms = RoomBoxes(
+    rooms = PosedRooms(
         F.pad(objects.object_class, empty), F.pad(objects.is_object, empty),
         F.pad(objects.boxes_m, (0, 0, *empty)), looks=looks,
     )  # fmt: skip

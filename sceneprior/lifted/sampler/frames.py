@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sceneprior.core.boxes import QUARTERS, turn_boxes
-from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.prototypes import POSES, turn_posed
+from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.rooms import gaps_to_sides_m, own_sides, rectangles_of
 
 FURTHEST_M = 1.0
@@ -31,7 +31,7 @@ def side_of(
     return own_sides(looks).gather(-1, sides[looks // POSES].unsqueeze(-1))[..., 0]
 
 
-def into_frames(rooms: RoomBoxes, back: Int[Tensor, " rooms"]) -> RoomBoxes:
+def into_frames(rooms: PosedRooms, back: Int[Tensor, " rooms"]) -> PosedRooms:
     """Turn every room so that its side `back` is at low z."""
     assert rooms.looks is not None
     quarters = -back % QUARTERS
@@ -60,7 +60,7 @@ def turn_places(
     return turn_rectangles(torch.cat([place_m, nothing], dim=-1), quarters)[:, :2]
 
 
-def gaps_by_side(rooms: RoomBoxes) -> Float[Tensor, "rooms objects 4"]:
+def gaps_by_side(rooms: PosedRooms) -> Float[Tensor, "rooms objects 4"]:
     """Gaps in metres from each object to the four sides of its room's rectangle: low z, low x, high
     z, high x."""
     low, high = gaps_to_sides_m(rooms.boxes_m, rectangles_of(rooms))
@@ -68,7 +68,7 @@ def gaps_by_side(rooms: RoomBoxes) -> Float[Tensor, "rooms objects 4"]:
 
 
 def mean_by_prototype(
-    values: Float[Tensor, "rooms objects 4"], rooms: RoomBoxes, prototypes: int
+    values: Float[Tensor, "rooms objects 4"], rooms: PosedRooms, prototypes: int
 ) -> tuple[Float[Tensor, "prototypes 4"], Bool[Tensor, " prototypes"]]:
     """Mean of the objects' values over the objects of each prototype, and whether it occurs."""
     assert rooms.looks is not None
@@ -78,7 +78,7 @@ def mean_by_prototype(
     return total / number.clamp(min=1).unsqueeze(-1), number > 0
 
 
-def find_backs(rooms: RoomBoxes, prototypes: int) -> Int[Tensor, " prototypes"]:
+def find_backs(rooms: PosedRooms, prototypes: int) -> Int[Tensor, " prototypes"]:
     """The side of each prototype, in pose 0, with the smallest mean gap to the sides of its rooms'
     rectangles; 0 for unused prototypes."""
     assert rooms.looks is not None

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sceneprior.core.boxes import QUARTERS
-from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.prototypes import Prototypes
+from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.frames import FURTHEST_M, gaps_by_side, mean_by_prototype, own_sides
 from sceneprior.lifted.sampler.rooms import shared_extents
 
@@ -29,7 +29,7 @@ STRIP = 0.2
 
 
 def find_fronts(
-    rooms: RoomBoxes, prototypes: Prototypes, count: int
+    rooms: PosedRooms, prototypes: Prototypes, count: int
 ) -> tuple[Int[Tensor, " count"], Float[Tensor, " count"]]:
     """The side to which each prototype's front points in pose 0, with a confidence.
 
@@ -63,7 +63,7 @@ def find_fronts(
     return fronts, sure
 
 
-def _gaps_to_furniture(rooms: RoomBoxes) -> Float[Tensor, "rooms objects 4"]:
+def _gaps_to_furniture(rooms: PosedRooms) -> Float[Tensor, "rooms objects 4"]:
     """Gap in metres from each side of each object to the nearest object on that side, at most
     `FURTHEST_M`; sides in the order of `gaps_by_side`."""
     boxes_m, here = rooms.boxes_m, rooms.is_object

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from sceneprior.core.views import RoomBoxes
+from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.network import RoomSampler
 from sceneprior.lifted.sampler.reading import Frame
 from sceneprior.lifted.sampler.rooms import frames_of, large_first, shuffled
@@ -17,7 +17,7 @@ PARTS_OF_OBJECT = ("look", "size", "place")
 
 def negative_log_likelihood(
     sampler: RoomSampler,
-    rooms: RoomBoxes,
+    rooms: PosedRooms,
     symmetry: Int[Tensor, " rooms"],
     generator: torch.Generator,
 ) -> dict[str, Float[Tensor, " rooms"]]:
@@ -58,6 +58,6 @@ def negative_log_likelihood(
     return {"class": listing, **found}
 
 
-def _first(rooms: RoomBoxes, row: Int[Tensor, " some"], step: int) -> RoomBoxes:
+def _first(rooms: PosedRooms, row: Int[Tensor, " some"], step: int) -> PosedRooms:
     """The rooms with indices `row`, cut to their first `step` objects."""
     return rooms.changed(lambda part: part[row, :step])

@@ -6,8 +6,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sceneprior.core.boxes import QUARTERS
-from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.prototypes import POSES
+from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.contents import MANY
 from sceneprior.lifted.sampler.frames import side_of
 
@@ -44,7 +44,7 @@ class LookScores(nn.Module):
     def forward(
         self,
         label: Int[Tensor, " rooms"],
-        before: RoomBoxes,
+        before: PosedRooms,
         counts: Float[Tensor, "rooms classes"],
         look_shown: Float[Tensor, "looks shown"],
         backs: Int[Tensor, " prototypes"],
@@ -65,7 +65,7 @@ class LookScores(nn.Module):
         )
 
     def directions(
-        self, label: Int[Tensor, " rooms"], before: RoomBoxes, backs: Int[Tensor, " prototypes"]
+        self, label: Int[Tensor, " rooms"], before: PosedRooms, backs: Int[Tensor, " prototypes"]
     ) -> Float[Tensor, "rooms 4"]:
         """Scores of the directions of the object's back: low z, low x, high z and high x. They are
         sums over the objects already placed."""
@@ -81,7 +81,7 @@ class LookScores(nn.Module):
         return torch.einsum("rosf,rof->rs", features.to(table), table)
 
     def repeats(
-        self, label: Int[Tensor, " rooms"], before: RoomBoxes, looks: int
+        self, label: Int[Tensor, " rooms"], before: PosedRooms, looks: int
     ) -> Float[Tensor, "rooms looks"]:
         """Scores of the looks whose prototype another object of the class has; 0 for the others."""
         assert before.looks is not None

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 
 from sceneprior.core.boxes import QUARTERS
 from sceneprior.core.mixtures import LogisticMixture, draw_index
-from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.prototypes import POSES, turn_posed
+from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.contents import Contents
 from sceneprior.lifted.sampler.look_scores import LookScores
 from sceneprior.lifted.sampler.placement import SHOWN, Placement
@@ -139,7 +139,7 @@ class RoomSampler(nn.Module):
         return torch.cat([found[..., :2], found[..., 2:].exp()], dim=-1)
 
     def tokens(
-        self, rooms: RoomBoxes, rectangle_m: Float[Tensor, "rooms 4"]
+        self, rooms: PosedRooms, rectangle_m: Float[Tensor, "rooms 4"]
     ) -> Float[Tensor, "rooms objects width"]:
         """Encoder inputs, one per object: class, look, size, height, and place in the rectangle
         (centre x, z, extents x, z)."""
@@ -155,7 +155,7 @@ class RoomSampler(nn.Module):
 
     def read(
         self,
-        before: RoomBoxes,
+        before: PosedRooms,
         coming: Float[Tensor, "rooms classes"],
         frame: Frame,
         tokens: Float[Tensor, "rooms objects width"],
@@ -173,7 +173,7 @@ class RoomSampler(nn.Module):
         return Reading(before, frame, coming, features[:, 0])
 
     def summary(
-        self, before: RoomBoxes, coming: Float[Tensor, "rooms classes"], frame: Frame
+        self, before: PosedRooms, coming: Float[Tensor, "rooms classes"], frame: Frame
     ) -> Float[Tensor, "rooms summary"]:
         """Features that attention could only obtain by counting: the number of objects of each
         class, placed and still to come, and the gaps between the furniture and each side of the
@@ -243,11 +243,11 @@ class RoomSampler(nn.Module):
             self.look_shown, self.backs,
         )  # fmt: skip
 
-    def counts(self, rooms: RoomBoxes) -> Float[Tensor, "rooms classes"]:
+    def counts(self, rooms: PosedRooms) -> Float[Tensor, "rooms classes"]:
         """Number of objects of each class."""
         return self.contents.before(rooms.object_class, rooms.is_object)[:, -1]
 
-    def log_prob(self, reading: Reading, coming: RoomBoxes) -> dict[str, Float[Tensor, " rooms"]]:
+    def log_prob(self, reading: Reading, coming: PosedRooms) -> dict[str, Float[Tensor, " rooms"]]:
         """Log-probabilities of the look, size and place of each room's next object, given its
         class. Every room of `coming` has one object."""
         assert coming.looks is not None

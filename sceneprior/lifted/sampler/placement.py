@@ -9,8 +9,8 @@ from torch import Tensor, nn
 
 from sceneprior.core.boxes import QUARTERS
 from sceneprior.core.mixtures import FIRST_SCALE, LogisticMixture
-from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.prototypes import PARTS
+from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.frames import into_frames, side_of, turn_rectangles
 from sceneprior.lifted.sampler.places import (
     BY_OBJECT,
@@ -72,7 +72,7 @@ class Placement(nn.Module):
         size_m: Float[Tensor, "rooms 3"],
         bottom_m: Float[Tensor, " rooms"],
         rectangle_m: Float[Tensor, "rooms 4"],
-        before: RoomBoxes,
+        before: PosedRooms,
         counts: Float[Tensor, "rooms counts"],
         look_shown: Float[Tensor, "looks shown"],
         backs: Int[Tensor, " prototypes"],
@@ -182,8 +182,8 @@ class AxisScore(nn.Module):
 
 def _alone(
     label: Int[Tensor, " rooms"], look: Int[Tensor, " rooms"], size_m: Float[Tensor, "rooms 3"]
-) -> RoomBoxes:
+) -> PosedRooms:
     """Rooms with one object each, at the origin."""
     boxes_m = torch.cat([torch.zeros_like(size_m), size_m], dim=-1).unsqueeze(1)
     is_object = torch.ones_like(label, dtype=torch.bool).unsqueeze(1)
-    return RoomBoxes(label.unsqueeze(1), is_object, boxes_m, looks=look.unsqueeze(1))
+    return PosedRooms(label.unsqueeze(1), is_object, boxes_m, looks=look.unsqueeze(1))

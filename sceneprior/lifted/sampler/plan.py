@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
-from sceneprior.core.views import RoomBoxes
+from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.network import RoomSampler
 from sceneprior.lifted.sampler.rooms import large_first, rectangle_sides, rectangles_of
 
@@ -24,7 +24,7 @@ BEYOND_M = 0.01
 class Given:
     """Conditions of the rooms to draw, one row per room."""
 
-    objects: RoomBoxes
+    objects: PosedRooms
     """Objects that are already there; looks need not be known."""
     rectangle_m: Float[Tensor, "rooms 4"] | None = None
     """Rectangle that the furniture may fill: centre x, z and extents x, z. None samples it."""
@@ -35,7 +35,7 @@ class Given:
 class Plan(NamedTuple):
     """Conditions of rooms before they are furnished: those of `Given`, completed by sampling."""
 
-    objects: RoomBoxes
+    objects: PosedRooms
     rectangle_m: Float[Tensor, "rooms 4"]
     coming: Int[Tensor, "rooms slots"]
     drawn: bool
@@ -50,7 +50,7 @@ class Plan(NamedTuple):
 def nothing_given(rooms: int) -> Given:
     """Empty conditions, to draw whole rooms."""
     none = torch.zeros(rooms, 0, dtype=torch.int64)
-    return Given(RoomBoxes(none, none > 0, torch.zeros(rooms, 0, 6)))
+    return Given(PosedRooms(none, none > 0, torch.zeros(rooms, 0, 6)))
 
 
 def uniform_numbers(count: int, each: int, seed: tuple[int, int]) -> Float[Tensor, "rooms numbers"]:
@@ -81,7 +81,7 @@ def plan_rooms(sampler: RoomSampler, given: Given, count: int, seed: tuple[int, 
     return Plan(objects, rectangle_m, coming.gather(1, order), drawn)
 
 
-def holding(tried: Float[Tensor, "rooms tries 4"], objects: RoomBoxes) -> Float[Tensor, "rooms 4"]:
+def holding(tried: Float[Tensor, "rooms tries 4"], objects: PosedRooms) -> Float[Tensor, "rooms 4"]:
     """The first of the sampled rectangles that contains the given objects; if none does, the first
     one, enlarged until it does."""
     if not objects.is_object.any():

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from sceneprior.core.views import RoomBoxes
+from sceneprior.lifted.rooms import PosedRooms
 
 OCTAVES = 6
 """Frequencies in the encoding of a length."""
@@ -40,7 +40,7 @@ class Frame(NamedTuple):
 class Reading(NamedTuple):
     """Encoder outputs for partly furnished rooms."""
 
-    before: RoomBoxes
+    before: PosedRooms
     frame: Frame
     coming: Float[Tensor, "rooms classes"]
     """Number of objects of each class that are still to be placed."""

@@ -11,10 +11,10 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from sceneprior.core.boxes import QUARTERS, turn_boxes
-from sceneprior.core.views import RoomBoxes
 from sceneprior.core.wall_lines import Wall
 from sceneprior.lifted.lifting.dataset import LiftedDataset
 from sceneprior.lifted.prototypes import POSES, Prototypes, turn_posed
+from sceneprior.lifted.rooms import PosedRooms
 
 GRAZE_M = 0.05
 """Overlap along an axis up to which an intersection of lifted boxes is attributed to their
@@ -58,7 +58,7 @@ class SamplerRooms:
         self.plain_ids = tuple(lifted.plain_ids)
         self._lifted = lifted
         self.prototypes: Prototypes
-        self.rooms: RoomBoxes
+        self.rooms: PosedRooms
 
     def assign_prototypes(self, prototypes: Prototypes) -> "SamplerRooms":
         """Set `rooms`, in which every object has a look, and return this data set.
@@ -76,7 +76,7 @@ class SamplerRooms:
             return pad_sequence([torch.from_numpy(values)[row] for row in kept], batch_first=True)
 
         self.prototypes = prototypes
-        self.rooms = RoomBoxes(
+        self.rooms = PosedRooms(
             object_class=padded(lifted.object_classes),
             is_object=padded(np.ones(len(looks), dtype=bool)),
             boxes_m=padded(boxes_m.astype(np.float32)),
@@ -98,7 +98,7 @@ class SamplerRooms:
         self.rooms = self.rooms.to(device)
         return self
 
-    def __getitems__(self, draws: list[tuple[int, int]]) -> RoomBoxes:
+    def __getitems__(self, draws: list[tuple[int, int]]) -> PosedRooms:
         """A batch of rows; each draw is (row, epoch). A draw of epoch `BLANK` gives an empty room,
         which does not contribute to the loss."""
         shown = torch.tensor([epoch >= 0 for _, epoch in draws])
@@ -134,7 +134,7 @@ def shared_extents(
     return torch.minimum(total - apart, least).clamp(min=0)
 
 
-def rectangles_of(rooms: RoomBoxes) -> Float[Tensor, "rooms 4"]:
+def rectangles_of(rooms: PosedRooms) -> Float[Tensor, "rooms 4"]:
     """The bounding rectangle of each room's footprints: centre x, z, extents x, z; zeros for an
     empty room."""
     if not rooms.boxes_m.shape[1]:
@@ -148,7 +148,7 @@ def rectangles_of(rooms: RoomBoxes) -> Float[Tensor, "rooms 4"]:
 
 
 def _walls_of(walls: Sequence[Wall], rectangle_m: np.ndarray) -> list[float]:
-    """One row of `RoomBoxes.walls_m`: for each side of the rectangle around the furniture, the
+    """One row of `PosedRooms.walls_m`: for each side of the rectangle around the furniture, the
     nearest wall that faces this side and overlaps with it along its direction."""
     middle, half = rectangle_m[:2], rectangle_m[2:] / 2
     found = []
@@ -171,7 +171,7 @@ def _walls_of(walls: Sequence[Wall], rectangle_m: np.ndarray) -> list[float]:
     return found
 
 
-def frames_of(rooms: RoomBoxes, generator: torch.Generator) -> Float[Tensor, "rooms 4"]:
+def frames_of(rooms: PosedRooms, generator: torch.Generator) -> Float[Tensor, "rooms 4"]:
     """`rectangles_of` with each side moved outwards: to the wall if known, otherwise by the
     absolute value of a normal random number.
 
@@ -198,7 +198,7 @@ def rectangle_sides(
     return middle - extents / 2, middle + extents / 2
 
 
-def gaps_m(rooms: RoomBoxes, rectangle_m: Float[Tensor, "rooms 4"]) -> Float[Tensor, "rooms 4"]:
+def gaps_m(rooms: PosedRooms, rectangle_m: Float[Tensor, "rooms 4"]) -> Float[Tensor, "rooms 4"]:
     """Gaps in metres between the furniture and the sides of a rectangle: the lower sides along x
     and z, then the upper ones. Meaningless in rooms without furniture."""
     low, high = rectangle_sides(rectangle_m)
@@ -216,7 +216,7 @@ def gaps_to_sides_m(
     return centre - half - low, high - centre - half
 
 
-def turned_rooms(rooms: RoomBoxes, symmetry: Int[Tensor, " rooms"]) -> RoomBoxes:
+def turned_rooms(rooms: PosedRooms, symmetry: Int[Tensor, " rooms"]) -> PosedRooms:
     """Every room in one of its `SYMMETRIES`: mirrored if `symmetry` is 4 or more, then turned by
     `symmetry` % 4 quarter turns."""
     assert rooms.looks is not None
@@ -239,7 +239,7 @@ def own_sides(looks: Int[Tensor, "*batch"]) -> Int[Tensor, "*batch 4"]:
     return (pose % QUARTERS + torch.where(pose >= QUARTERS, -own, own)) % QUARTERS
 
 
-def shuffled(rooms: RoomBoxes, generator: torch.Generator) -> RoomBoxes:
+def shuffled(rooms: PosedRooms, generator: torch.Generator) -> PosedRooms:
     """Every room's objects in a random order, followed by its padding."""
     tickets = torch.rand(rooms.is_object.shape, generator=generator).to(rooms.boxes_m.device)
     return rooms.take(tickets.masked_fill(~rooms.is_object, 2.0).argsort(dim=1))

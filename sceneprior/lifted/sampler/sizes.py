@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.prototypes import POSES, Prototypes
+from sceneprior.lifted.rooms import PosedRooms
 
 SIZES = 32
 """Maximum number of sizes of a prototype; the most frequent ones are kept."""
@@ -26,7 +26,7 @@ unusual size is more often an error of lifting than truly rare."""
 
 
 def find_sizes(
-    rooms: RoomBoxes, prototypes: Prototypes, count: int
+    rooms: PosedRooms, prototypes: Prototypes, count: int
 ) -> tuple[
     Float[Tensor, "count sizes 3"], Float[Tensor, "count sizes"], Float[Tensor, "count sizes"]
 ]:

@@ -11,8 +11,8 @@ from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from sklearn.mixture import GaussianMixture
 from torch import Tensor, nn
 
-from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.prototypes import POSES
+from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.contents import END
 from sceneprior.lifted.sampler.frames import find_backs
 from sceneprior.lifted.sampler.fronts import find_fronts
@@ -72,7 +72,7 @@ class SamplerStage(lightning.LightningModule):
         self.least: Tensor
         self.register_buffer("least", torch.tensor(math.inf))
 
-    def training_step(self, rooms: RoomBoxes, batch_idx: int) -> Tensor:
+    def training_step(self, rooms: PosedRooms, batch_idx: int) -> Tensor:
         """Mean negative log-likelihood of the batch's rooms."""
         generator = torch.Generator().manual_seed(batch_seed(self.seed, self.trainer, batch_idx))
         with full_precision(self.device):
@@ -88,7 +88,7 @@ class SamplerStage(lightning.LightningModule):
         log_losses(self, means, total, len(rooms.boxes_m))
         return total
 
-    def on_train_batch_end(self, outputs: Any, batch: RoomBoxes, batch_idx: int) -> None:
+    def on_train_batch_end(self, outputs: Any, batch: PosedRooms, batch_idx: int) -> None:
         """Every few epochs, keep the network if the val rooms' likelihood is the highest so far.
 
         This runs after the last batch of the epoch, because the epoch's checkpoint is written

@@ -5,7 +5,7 @@ import torch
 from rooms_of_boxes import sampler_rooms, small_sampler
 from torch.testing import assert_close
 
-from sceneprior.core.views import RoomBoxes
+from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler import draw as module
 from sceneprior.lifted.sampler.draw import draw_rooms
 from sceneprior.lifted.sampler.plan import BEYOND_M, Given, holding, nothing_given
@@ -25,9 +25,9 @@ def sampler(rooms):
     return small_sampler(rooms)
 
 
-def given(count: int, label: int, box: list[float]) -> RoomBoxes:
+def given(count: int, label: int, box: list[float]) -> PosedRooms:
     """Rooms with one object each."""
-    return RoomBoxes(
+    return PosedRooms(
         torch.full((count, 1), label),
         torch.ones(count, 1, dtype=torch.bool),
         torch.tensor(box).expand(count, 1, 6),
@@ -130,7 +130,7 @@ def test_asked_classes_come_and_no_others(sampler):
 
 
 def test_a_full_room_takes_nothing_more(sampler):
-    full = RoomBoxes(
+    full = PosedRooms(
         torch.ones(2, 5, dtype=torch.int64),
         torch.ones(2, 5, dtype=torch.bool),
         torch.tensor([0.0, 0.4, 0, 1, 0.8, 1]).repeat(2, 5, 1),

@@ -4,8 +4,8 @@ import torch
 
 from sceneprior.core.boxes import QUARTERS, turn_boxes
 from sceneprior.core.parts import whole_box
-from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.prototypes import Prototypes, turn_posed
+from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.frames import own_sides, side_of
 from sceneprior.lifted.sampler.fronts import _gaps_to_furniture, find_fronts
 from sceneprior.lifted.sampler.rooms import SYMMETRIES, turned_rooms
@@ -30,9 +30,9 @@ def chair(back: int) -> np.ndarray:
     return grid
 
 
-def room(*boxes_m: list[float], looks: list[int]) -> RoomBoxes:
+def room(*boxes_m: list[float], looks: list[int]) -> PosedRooms:
     count = len(boxes_m)
-    return RoomBoxes(
+    return PosedRooms(
         torch.ones(1, count, dtype=torch.int64), torch.ones(1, count, dtype=torch.bool),
         torch.tensor([boxes_m]), looks=torch.tensor([looks]),
     )  # fmt: skip
@@ -74,7 +74,7 @@ def test_fronts_turn_with_their_rooms():
     boxes_m[..., ::2] *= 2
     looks = torch.randint(0, 16, (6, 5), generator=rng)
     here = torch.rand(6, 5, generator=rng) < 0.8
-    rooms = RoomBoxes(torch.ones(6, 5, dtype=torch.int64), here, boxes_m, looks=looks)
+    rooms = PosedRooms(torch.ones(6, 5, dtype=torch.int64), here, boxes_m, looks=looks)
     kinds = prototypes(chair(1), np.ones((CELLS,) * 3, dtype=bool))
     fronts, confidence = find_fronts(rooms, kinds, 2)
     for symmetry in range(SYMMETRIES):

@@ -7,8 +7,8 @@ import torch
 from torch.testing import assert_close
 
 from sceneprior.core.boxes import QUARTERS
-from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.prototypes import POSES, turn_posed
+from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.contents import MANY
 from sceneprior.lifted.sampler.frames import side_of
 from sceneprior.lifted.sampler.look_scores import MOST_LOG, LookScores
@@ -31,7 +31,7 @@ def scores() -> LookScores:
 
 
 @pytest.fixture
-def rooms() -> RoomBoxes:
+def rooms() -> PosedRooms:
     """Four rooms with four objects each; the last one has two."""
     rng = torch.Generator().manual_seed(2)
     boxes_m = 0.2 + torch.rand(4, 4, 6, generator=rng).double()
@@ -39,7 +39,7 @@ def rooms() -> RoomBoxes:
     is_object = torch.ones(4, 4, dtype=torch.bool)
     is_object[-1, 2:] = False
     classes = torch.randint(1, CLASSES, (4, 4), generator=rng)
-    return RoomBoxes(
+    return PosedRooms(
         classes * is_object, is_object, boxes_m,
         looks=torch.randint(LOOKS, (4, 4), generator=rng),
     )  # fmt: skip
@@ -56,7 +56,7 @@ def look_shown() -> torch.Tensor:
     return torch.nn.functional.pad(torch.stack(poses, dim=1).flatten(0, 1), (4, 0))
 
 
-def scored(scores: LookScores, rooms: RoomBoxes) -> torch.Tensor:
+def scored(scores: LookScores, rooms: PosedRooms) -> torch.Tensor:
     return scores(LABEL, rooms, COUNTS, look_shown(), BACKS)
 
 
@@ -105,7 +105,7 @@ def test_order_and_padding_change_nothing(scores, rooms):
     order = torch.tensor([[3, 1, 0, 2], [2, 3, 1, 0], [1, 0, 3, 2], [1, 0, 2, 3]])
     assert_close(scored(scores, rooms.take(order)), plain)
     boxes_m = rooms.boxes_m.where(rooms.is_object.unsqueeze(-1), 0.0)
-    padded = RoomBoxes(rooms.object_class, rooms.is_object, boxes_m, looks=rooms.looks)
+    padded = PosedRooms(rooms.object_class, rooms.is_object, boxes_m, looks=rooms.looks)
     assert_close(scored(scores, padded), plain)
 
 

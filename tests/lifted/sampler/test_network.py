@@ -9,8 +9,8 @@ from rooms_of_boxes import sampler_rooms, small_sampler
 from torch.testing import assert_close
 
 from sceneprior.core.boxes import QUARTERS
-from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.prototypes import turn_posed
+from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.contents import END
 from sceneprior.lifted.sampler.likelihood import negative_log_likelihood
 from sceneprior.lifted.sampler.reading import Frame
@@ -34,15 +34,15 @@ def sampler(rooms):
     return small_sampler(rooms).double()
 
 
-def in_float64(rooms: RoomBoxes) -> RoomBoxes:
+def in_float64(rooms: PosedRooms) -> PosedRooms:
     return rooms.changed(lambda part: part.double() if part.is_floating_point() else part)
 
 
-def as_they_are(rooms: RoomBoxes) -> torch.Tensor:
+def as_they_are(rooms: PosedRooms) -> torch.Tensor:
     return torch.zeros(len(rooms.boxes_m), dtype=torch.int64)
 
 
-def read(sampler, rooms: RoomBoxes, rectangle_m: torch.Tensor, coming=None, symmetry=None):
+def read(sampler, rooms: PosedRooms, rectangle_m: torch.Tensor, coming=None, symmetry=None):
     if coming is None:
         coming = torch.zeros(len(rooms.boxes_m), len(sampler.may_meet)).double()
     frame = Frame(rectangle_m, as_they_are(rooms) if symmetry is None else symmetry)
@@ -57,7 +57,7 @@ def test_order_and_padding_change_nothing(sampler, rooms):
     mixed = read(sampler, whole.take(order), frame)
     assert_close(mixed.context, plain.context)
     wrong = whole.boxes_m.where(whole.is_object.unsqueeze(-1), 99.0)
-    filled = RoomBoxes(whole.object_class, whole.is_object, wrong, looks=whole.looks)
+    filled = PosedRooms(whole.object_class, whole.is_object, wrong, looks=whole.looks)
     assert torch.equal(read(sampler, filled, frame).context, plain.context)
 
 
@@ -181,7 +181,7 @@ class _Likelihood(torch.nn.Module):
         super().__init__()
         self.sampler = copy.deepcopy(sampler)
 
-    def forward(self, rooms: RoomBoxes) -> dict[str, torch.Tensor]:
+    def forward(self, rooms: PosedRooms) -> dict[str, torch.Tensor]:
         generator = torch.Generator().manual_seed(0)
         return negative_log_likelihood(self.sampler, rooms, as_they_are(rooms), generator)
 

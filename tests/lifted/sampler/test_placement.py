@@ -6,8 +6,8 @@ from torch.testing import assert_close
 
 from sceneprior.core.boxes import QUARTERS, turn_boxes
 from sceneprior.core.mixtures import LogisticMixture
-from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.prototypes import POSES, turn_posed
+from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler import places as module
 from sceneprior.lifted.sampler.frames import (
     find_backs,
@@ -33,16 +33,16 @@ def placement() -> Placement:
     return placement
 
 
-def rooms_with(boxes_m: torch.Tensor, looks: torch.Tensor) -> RoomBoxes:
+def rooms_with(boxes_m: torch.Tensor, looks: torch.Tensor) -> PosedRooms:
     """Rooms with two objects, the last one with one."""
     is_object = torch.ones_like(looks, dtype=torch.bool)
     is_object[-1, -1] = False
-    return RoomBoxes(
+    return PosedRooms(
         torch.arange(1, 3).expand_as(looks) * is_object, is_object, boxes_m, looks=looks
     )
 
 
-def distribution(placement: Placement, rooms: RoomBoxes, look, size_m, rectangle_m) -> Places:
+def distribution(placement: Placement, rooms: PosedRooms, look, size_m, rectangle_m) -> Places:
     shown = torch.rand(LOOKS, 67, generator=torch.Generator().manual_seed(1)).double()
     label, counts = torch.full_like(look, 3), torch.ones(len(look), 2 * CLASSES).double()
     return placement(
@@ -68,7 +68,7 @@ def test_places_turn_with_the_room(placement, given, quarters):
     place_m = torch.tensor([[0.5, 0.1], [1.0, -1.0], [-1.5, 0.7]]).double()
     plain = distribution(placement, rooms, look, size_m, rectangle_m).log_prob(place_m)
     assert rooms.looks is not None
-    turned = RoomBoxes(
+    turned = PosedRooms(
         rooms.object_class, rooms.is_object, turn_boxes(rooms.boxes_m, by),
         looks=turn_posed(rooms.looks, by, no),
     )  # fmt: skip
@@ -88,7 +88,7 @@ def test_order_and_padding_of_objects_change_nothing(placement, given):
         distribution(placement, swapped, look, size_m, rectangle_m).log_prob(place_m), plain
     )
     boxes_m = rooms.boxes_m.where(rooms.is_object.unsqueeze(-1), 7.0)
-    filled = RoomBoxes(rooms.object_class, rooms.is_object, boxes_m, looks=rooms.looks)
+    filled = PosedRooms(rooms.object_class, rooms.is_object, boxes_m, looks=rooms.looks)
     assert torch.equal(
         distribution(placement, filled, look, size_m, rectangle_m).log_prob(place_m), plain
     )
@@ -167,7 +167,7 @@ def test_draws_follow_the_density(placement, given, monkeypatch):
 def test_without_objects_and_larger_than_the_rectangle(placement):
     """Anchors flush with either side of a rectangle that is too small are its middle."""
     nothing = torch.zeros(1, 0, dtype=torch.int64)
-    rooms = RoomBoxes(nothing, nothing > 0, torch.zeros(1, 0, 6).double(), looks=nothing)
+    rooms = PosedRooms(nothing, nothing > 0, torch.zeros(1, 0, 6).double(), looks=nothing)
     rectangle_m = torch.tensor([[1.0, 2.0, 0.5, 0.5]]).double()
     found = distribution(
         placement, rooms, torch.tensor([0]), torch.full((1, 3), 3.0).double(), rectangle_m
@@ -188,7 +188,7 @@ def test_an_object_learns_to_stand_beside_another():
     boxes_m[:, 0, [0, 2]] = torch.rand(many, 2, generator=rng).double() - 0.5
     here = torch.ones(many, 1, dtype=torch.bool)
     looks = torch.zeros(many, 1, dtype=torch.int64)
-    rooms = RoomBoxes(here.long(), here, boxes_m, looks=looks)
+    rooms = PosedRooms(here.long(), here, boxes_m, looks=looks)
     size_m = torch.tensor([0.5, 0.5, 0.5]).double().repeat(many, 1)
     frame = torch.tensor([0.0, 0.0, 6.0, 6.0]).double().expand(many, -1)
     beside_m = boxes_m[:, 0, [0, 2]] + torch.tensor([1.0, -0.75]).double()
@@ -212,12 +212,12 @@ def test_the_back_is_the_side_at_the_wall():
     mirrored has its back at the other side along x."""
     box = torch.tensor([[[-2.0, 0.5, 0.5, 1.0, 1.0, 1.0], [0.0, 0.1, 0.0, 5.0, 0.2, 5.0]]])
     here = torch.tensor([[True, True]])
-    plain = RoomBoxes(torch.tensor([[1, 2]]), here, box, looks=torch.tensor([[8, 0]]))
+    plain = PosedRooms(torch.tensor([[1, 2]]), here, box, looks=torch.tensor([[8, 0]]))
     quarters = torch.arange(QUARTERS).repeat(2)
     mirrored = torch.arange(2 * QUARTERS) >= QUARTERS
     many = plain.changed(lambda part: part.repeat(2 * QUARTERS, *[1] * (part.ndim - 1)))
     assert many.looks is not None
-    rooms = RoomBoxes(
+    rooms = PosedRooms(
         many.object_class, many.is_object, turn_boxes(many.boxes_m, quarters, mirrored),
         looks=turn_posed(many.looks, quarters, mirrored),
     )  # fmt: skip

@@ -10,9 +10,9 @@ from rooms_of_boxes import CLASSES, lifted_rooms, sampler_rooms
 from torch.testing import assert_close
 
 from sceneprior.core.boxes import turn_boxes
-from sceneprior.core.views import RoomBoxes
 from sceneprior.core.wall_lines import Wall
 from sceneprior.lifted.lifting.dataset import LiftedDataset
+from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.rooms import (
     FRAME_M,
     LOOSELY,
@@ -64,9 +64,9 @@ def test_a_blank_draw_is_an_empty_room(rooms):
 def test_rectangles_hold_all_footprints_and_no_more():
     boxes_m = torch.tensor([[[0.0, 1, 0, 2, 2, 1], [2.0, 1, 1, 1, 1, 1], [9.0, 9, 9, 9, 9, 9]]])
     here = torch.tensor([[True, True, False]])
-    found = rectangles_of(RoomBoxes(here.long(), here, boxes_m))
+    found = rectangles_of(PosedRooms(here.long(), here, boxes_m))
     assert_close(found, torch.tensor([[0.75, 0.5, 3.5, 2.0]]))
-    assert not rectangles_of(RoomBoxes(here.long() * 0, here & False, boxes_m)).any()
+    assert not rectangles_of(PosedRooms(here.long() * 0, here & False, boxes_m)).any()
 
 
 def test_frames_hold_the_rectangle_and_a_little_more(rooms):
@@ -131,7 +131,7 @@ def test_walls_turn_with_their_room(rooms, symmetry):
 
 def test_gaps_to_the_sides_of_a_rectangle():
     box = torch.tensor([[[0.5, 0.5, 0.0, 1.0, 1.0, 1.0]]])
-    one = RoomBoxes(torch.ones(1, 1, dtype=torch.int64), torch.ones(1, 1, dtype=torch.bool), box)
+    one = PosedRooms(torch.ones(1, 1, dtype=torch.int64), torch.ones(1, 1, dtype=torch.bool), box)
     assert gaps_m(one, torch.tensor([[0.0, 0.0, 4.0, 2.0]])).tolist() == [[2.0, 0.5, 1.0, 0.5]]
 
 
