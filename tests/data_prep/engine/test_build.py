@@ -1,54 +1,55 @@
-"""Houses to shards: right boxes, the same bytes whatever the workers, resumed, reported."""
+"""Houses to shards: right boxes, the same bytes whatever the workers, failures for themselves."""
+
+import json
 
 import numpy as np
 import pytest
 from front_files import bedroom, room
 from front_jobs import digests, front_job, rooms_of, three_houses
 from front_reading import shared_front
+from golden import hold
+from refusals import refused
+from toy_source import ToySource
 
-from data_prep.engine.build import Job, build_shards
+from data_prep.engine.build import Job, build_shards, read_finished
 from data_prep.front.recipe import load_recipe
 from data_prep.front.source import FrontSource
 from data_prep.inspection.agreement import true_bodies
 from data_prep.inspection.verify import verify
 from sceneprior.core.classes import label_set
-from sceneprior.core.errors import InputError
-from sceneprior.core.shards import list_shards, read_index
+from sceneprior.core.shards import read_index
 
-
-def projected(corners, turn, K):
-    points = corners @ turn[:3, :3].T + turn[:3, 3]
-    pixels = points @ K.T
-    return pixels[:, :2] / pixels[:, 2:], points[:, 2].min()
+TROUBLE = {1: "sentence", 2: "unforeseen", 3: "unreadable", 5: "shapes", 8: "filtered"}
 
 
 def test_a_whole_job(front, tmp_path):
     three_houses(front)
-    out = tmp_path / "shards"
-    summary = build_shards(front_job(front, out))
-    assert summary.statuses == {"prepared": 6} and summary.renderer == "software"
-    rooms = {split: counts["rooms"] for split, counts in summary.counts.items()}
-    assert rooms == {"train": 4, "val": 1, "test": 1}
-    index = read_index(out)
-    assert index["label_set"] == "front3d_bedroom" and index["room_type"] == "bedroom"
-    assert index["counts"] == summary.counts
-    assert [path.name for path in list_shards(out, "train")] == ["bedroom_0000.h5"]
-    rooms = rooms_of(out)
-    assert sorted(rooms) == sorted(
-        f"house{k}_{kind}-{k}" for k in range(3) for kind in ("Bedroom", "MasterBedroom")
-    )
+    front.house("other", *(bedroom(f"Bedroom-{k}") for k in range(10)))  # more than one shard
+    one, two, third = tmp_path / "one", tmp_path / "two", tmp_path / "three"
+    summary = build_shards(front_job(front, one, workers=1))
+    build_shards(front_job(front, two, workers=2))
+    assert len(digests(one, "train/*.h5")) == 2 and digests(one) == digests(two)
+    build_shards(front_job(front, third, seed=1))
+    assert digests(third, "**/*.h5") != digests(one, "**/*.h5")
+    index = read_index(one)
+    assert index["counts"] == summary.counts and summary.statuses == {"prepared": 16}
     names = label_set("front3d_bedroom")
-    for views, truth in rooms.values():
-        assert views.image_size == (90, 120) and len(views.visible) == 8  # 16 m2 at 0.5, at least 8
-        assert [names[c] for c in views.object_class] == ["double_bed", "nightstand", "nightstand"]
-        assert views.visible.any(axis=0).all()
+    found = {}
+    for room_id, (views, truth) in rooms_of(one).items():
         # The bed of 1.8 x 1.0 x 2.0 at (0, 0, -1), the floor's centre being the origin.
         np.testing.assert_allclose(truth.centers_m[0], (0, 0.5, -1), atol=1e-6)
         np.testing.assert_allclose(truth.sizes_m[0], (1.8, 1.0, 2.0), atol=1e-6)
         np.testing.assert_allclose(truth.yaw_rad, (0, 0, np.pi / 2), atol=1e-6)
         assert truth.model_ids == ("bed", "stand", "stand")
-        assert truth.height_m == pytest.approx(2.6)
-        np.testing.assert_allclose(np.abs(truth.floor_m), 2)
+        assert true_bodies(views, truth, one)[1] == []
+        found[room_id] = {
+            "classes": [names[c] for c in views.object_class],
+            "size": views.image_size,
+            "eyes": views.world_to_camera[:, :3, 3].astype(float).tolist(),
+            "floor": truth.floor_m.astype(float).tolist(),
+            "height": float(truth.height_m),
+        }
+    hold("shards", {"rooms": found, "counts": summary.counts, "index": index}, slack=1e-4)
 
 
 def test_boxes_of_free_standing_pieces_are_their_projected_corners(front, tmp_path):
@@ -66,16 +67,19 @@ def test_boxes_of_free_standing_pieces_are_their_projected_corners(front, tmp_pa
             here.min(axis=0), truth.centers_m[0] - truth.sizes_m[0] / 2, atol=1e-6
         )
         for view in np.flatnonzero(views.visible[:, 0]):
-            pixels, nearest = projected(here, views.world_to_camera[view], views.intrinsics[view])
+            turn, K = views.world_to_camera[view], views.intrinsics[view]
+            points = here @ turn[:3, :3].T + turn[:3, 3]
+            pixels = (points @ K.T)[:, :2] / points[:, 2:]
             expected = np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
-            if nearest < 0.05 or expected.min() < 0 or (expected > (480, 360, 480, 360)).any():
+            outside = expected.min() < 0 or (expected > (480, 360, 480, 360)).any()
+            if points[:, 2].min() < 0.05 or outside:
                 continue
             found = views.boxes[view, 0] * (480, 360, 480, 360)
             # Pixel centres: never more than half a pixel outside, and only the thin tip of a
             # corner may fall between centres.
-            outside = (found - expected) * (-1, -1, 1, 1)
-            assert outside.max() <= 0.501 and outside.min() > -2
-            errors += np.abs(outside).tolist()
+            off = (found - expected) * (-1, -1, 1, 1)
+            assert off.max() <= 0.501 and off.min() > -2
+            errors += np.abs(off).tolist()
     assert len(errors) > 40 and np.mean(errors) < 0.3
 
 
@@ -100,64 +104,31 @@ def test_what_void_hides_is_not_seen(front, tmp_path):
         assert names[truth.object_class[2]] == "nightstand" and len(truth.object_class) == 3
 
 
-def test_models_fit_the_ground_truth(front, tmp_path):
+def test_models_are_binary_and_mirrored_pieces_fit_them(front, tmp_path):
     mirrored = {"jid": "stand", "pos": (1.0, 0.2, 1.0), "yaw": 0.5, "scale": [-1.5, 1, 2]}
-    pieces = [{"jid": "bed", "pos": (-1.0, 0.0, -1.0)}, mirrored]
-    front.house("house", *(room(f"Bedroom-{k}", pieces) for k in range(2)))
+    front.house("house", room("A", [{"jid": "bed", "pos": (-1.0, 0.0, -1.0)}, mirrored]))
     out = tmp_path / "shards"
     build_shards(front_job(front, out))
-    for views, truth in rooms_of(out).values():
-        assert true_bodies(views, truth, out)[1] == []
+    ((views, truth),) = rooms_of(out).values()
+    assert true_bodies(views, truth, out)[1] == []
     header = (out / "models" / "bed.ply").read_bytes()[:400].split(b"end_header")[0].decode()
     assert "format binary_little_endian" in header
-    assert [line.split()[-1] for line in header.splitlines() if line.startswith("property")] == [
-        "x", "y", "z", "vertex_indices",
-    ]  # fmt: skip
-
-
-def test_same_seed_same_bytes_whatever_the_workers(front, tmp_path):
-    three_houses(front)
-    front.house("other", *(bedroom(f"Bedroom-{k}") for k in range(10)))  # more than one shard
-    one, two, third = tmp_path / "one", tmp_path / "two", tmp_path / "three"
-    build_shards(front_job(front, one, workers=1))
-    build_shards(front_job(front, two, workers=2))
-    assert len(digests(one, "train/*.h5")) == 2
-    assert digests(one) == digests(two)
-    build_shards(front_job(front, third, seed=1))
-    assert digests(third, "**/*.h5") != digests(one, "**/*.h5")
+    properties = [line.split()[-1] for line in header.splitlines() if line.startswith("property")]
+    assert properties == ["x", "y", "z", "vertex_indices"]
 
 
 def test_a_room_is_the_same_alone(front, tmp_path):
     three_houses(front)
     build_shards(front_job(front, tmp_path / "all"))
-    build_shards(front_job(front, tmp_path / "one", only="house1/MasterBedroom-1"))
-    build_shards(front_job(front, tmp_path / "id", only="house1_MasterBedroom-1"))
-    build_shards(front_job(front, tmp_path / "house", only="house1"))
-    assert list(rooms_of(tmp_path / "one")) == ["house1_MasterBedroom-1"]
-    assert list(rooms_of(tmp_path / "id")) == ["house1_MasterBedroom-1"]
-    assert len(rooms_of(tmp_path / "house")) == 2
     whole = rooms_of(tmp_path / "all")["house1_MasterBedroom-1"][0]
-    for name in ("one", "id", "house"):
-        alone = rooms_of(tmp_path / name)["house1_MasterBedroom-1"][0]
+    for only, rooms in (("house1/MasterBedroom-1", 1), ("house1_MasterBedroom-1", 1),
+                        ("house1", 2)):  # fmt: skip
+        out = tmp_path / only.replace("/", "-")
+        build_shards(front_job(front, out, only=only))
+        found = rooms_of(out)
+        assert len(found) == rooms
+        alone = found["house1_MasterBedroom-1"][0]
         np.testing.assert_array_equal(alone.instance_ids, whole.instance_ids)
-    with pytest.raises(InputError, match=r"has no house 'nowhere' .*: --only HOUSE/nowhere\."):
-        build_shards(front_job(front, tmp_path / "none", only="nowhere"))
-
-
-def test_a_second_run_makes_only_what_is_missing(front, tmp_path):
-    front.house("house", *(bedroom(f"Bedroom-{k}") for k in range(20)))
-    out = tmp_path / "shards"
-    first = build_shards(front_job(front, out))
-    assert (first.shards_made, first.shards_kept) == (4, 0)  # 18 and 2 rooms
-    before = digests(out)
-    times = {path: path.stat().st_mtime_ns for path in out.glob("**/*.h5")}
-    second = build_shards(front_job(front, out))
-    assert (second.shards_made, second.shards_kept) == (0, 4)
-    assert {path: path.stat().st_mtime_ns for path in out.glob("**/*.h5")} == times
-    (out / "train" / "bedroom_0001.h5").unlink()
-    third = build_shards(front_job(front, out))
-    assert (third.shards_made, third.shards_kept) == (1, 3)
-    assert digests(out) == before
 
 
 def test_houses_made_by_others(tmp_path):
@@ -173,3 +144,63 @@ def test_houses_made_by_others(tmp_path):
     found = verify(tmp_path / "a")
     tally = found.agreement.of("mesh")
     assert found.problems == () and tally.whole > 3 and tally.mean_iou > 0.95
+
+
+def test_a_source_that_draws_nothing_comes_through_the_same_door(tmp_path):
+    one, two = tmp_path / "one", tmp_path / "two"
+    summary = build_shards(Job(ToySource(), one))
+    assert summary.renderer is None and summary.statuses == {"prepared": 10, "filtered": 1}
+    index = read_index(one)
+    assert (index["source"], index["renderer"], index["seed"]) == ("toy", None, None)
+    assert (one / "models" / "toy.ply").is_file()
+    build_shards(Job(ToySource(), two, workers=2))
+    assert digests(one) == digests(two)
+    with refused("engine/other source", tmp=tmp_path):
+        build_shards(Job(ToySource(11, name="other"), one))
+
+
+def test_each_room_fails_for_itself_and_is_tried_again_when_asked(tmp_path):
+    out = tmp_path / "shards"
+    summary = build_shards(Job(ToySource(trouble=TROUBLE), out))
+    assert summary.statuses == {"prepared": 5, "filtered": 2, "failed": 4}
+    assert sorted(rooms_of(out)) == ["box_0", "box_4", "box_6", "box_7", "box_9"]
+    lines = {line["room_id"]: line for line in summary.report["rooms"]}
+    hold("shards", {"failures": {k: lines[f"box_{k}"] for k in TROUBLE}})
+    assert build_shards(Job(ToySource(), out)).shards_made == 0
+    again = build_shards(Job(ToySource(), out, retry_failed=True))
+    assert (again.shards_made, again.shards_kept) == (1, 1)
+    assert again.statuses == {"prepared": 10, "filtered": 1}
+
+
+def test_a_damaged_report_is_work_to_do(tmp_path):
+    out = tmp_path / "shards"
+    build_shards(Job(ToySource(), out))
+    expected = digests(out)
+    path = out / "train" / "toys_0000.report.json"
+    for text in ("", "[]", '{"renderer": null}', '{"renderer": null, "lines": [{"room_id": 1}]}'):
+        path.write_text(text)
+        assert read_finished(out / "train" / "toys_0000.h5") is None
+    assert build_shards(Job(ToySource(), out)).shards_made == 1
+    assert digests(out) == expected
+
+
+def test_a_house_that_is_cut_off_meanwhile_costs_its_own_rooms_only(front, tmp_path):
+    front.house("cut", bedroom("Bedroom-1"), bedroom("Bedroom-2"))
+    front.house("good", bedroom("Bedroom-3"), bedroom("Bedroom-4"), bedroom("Bedroom-5"))
+    splits = tmp_path / "splits.csv"
+    splits.write_text("".join(f"Bedroom-{k},{'test' if k == 5 else 'train'}\n" for k in range(6)))
+    job = front_job(front, tmp_path / "shards", splits=splits)
+    build_shards(job)
+    (job.out / "train" / "bedroom_0000.h5").unlink()
+    text = (front.front / "cut.json").read_bytes()
+    (front.front / "cut.json").write_bytes(b"{" * len(text))  # the size is what a folder remembers
+    assert build_shards(job).statuses == {"prepared": 3, "failed": 2}
+    report = json.loads((job.out / "report.json").read_text())
+    assert {item["room_id"] for item in report["failed"]} == {"cut_Bedroom-1", "cut_Bedroom-2"}
+    assert all("cut.json is not JSON" in item["reason"] for item in report["failed"])
+
+
+def test_debugging_lets_the_unforeseen_through(tmp_path, monkeypatch):
+    monkeypatch.setenv("SCENEPRIOR_DEBUG", "1")
+    with pytest.raises(KeyError, match="surprise"):
+        build_shards(Job(ToySource(trouble={2: "unforeseen"}), tmp_path / "shards"))

@@ -1,46 +1,52 @@
 """A folder remembers what it was begun for: the same goes on, anything else is refused."""
 
 import json
+from collections import Counter
 
 import pytest
-from front_files import bedroom
+from front_files import bedroom, room
 from front_jobs import digests, front_job, rooms_of, three_houses
+from refusals import refused
 
 from data_prep.engine.build import build_shards
-from sceneprior.core.errors import InputError
+from data_prep.engine.plan import house_may_match, is_asked_for, seeded_split
 
 
 def test_other_settings_want_another_folder(front, tmp_path):
     three_houses(front)
     out = tmp_path / "shards"
     build_shards(front_job(front, out))
-    with pytest.raises(InputError, match=r"begun with other settings \(seed differ\).*new folder"):
+    with refused("engine/other seed", tmp=tmp_path):
         build_shards(front_job(front, out, seed=1))
-    with pytest.raises(InputError, match=r"\(recipe, renderer differ\)"):
+    with refused("engine/other recipe and renderer", tmp=tmp_path):
         build_shards(front_job(front, out, rules=("views.per_m2=3",), renderer="pyrender"))
     front.house("house9", bedroom("Bedroom-9"))
-    with pytest.raises(InputError, match=r"\(houses differ\)"):
+    with refused("engine/other houses", tmp=tmp_path):
         build_shards(front_job(front, out))
     plan = json.loads((out / "plan.json").read_text())
     plan["settings"]["plan_version"] = 1
-    (out / "plan.json").write_text(json.dumps(plan | {"rooms": [{"room_id": "a", "area_m2": 1}]}))
-    with pytest.raises(
-        InputError, match=r"was written by another release \(plan version 1\); choose a new"
-    ):
-        build_shards(front_job(front, out))
-    (out / "plan.json").write_text("{")
-    with pytest.raises(InputError, match=r"plan\.json cannot be read"):
-        build_shards(front_job(front, out))
+    older = json.dumps(plan | {"rooms": [{"room_id": "a", "area_m2": 1}]})
+    for name, text in (("of another release", older), ("damaged", "{")):
+        (out / "plan.json").write_text(text)
+        with refused(f"engine/plan {name}", tmp=tmp_path):
+            build_shards(front_job(front, out))
     (out / "plan.json").unlink()
-    with pytest.raises(InputError, match=r"holds shards without a plan\.json"):
+    with refused("engine/shards without a plan", tmp=tmp_path):
         build_shards(front_job(front, out))
 
 
 def test_only_works_on_a_part_of_a_folder_that_was_begun_for_everything(front, tmp_path):
     front.house("house", *(bedroom(f"Bedroom-{k}") for k in range(20)))
     out = tmp_path / "shards"
-    build_shards(front_job(front, out))
+    first = build_shards(front_job(front, out))
+    assert (first.shards_made, first.shards_kept) == (4, 0)  # 18 and 2 rooms
     expected = digests(out)
+    times = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
+    again = build_shards(front_job(front, out))
+    assert (again.shards_made, again.shards_kept) == (0, 4)
+    build_shards(front_job(front, out, only="house/Bedroom-3"))
+    # Not one file is written again, so a finished folder may be read-only.
+    assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == times
     for name in ("train/bedroom_0001.h5", "test/bedroom_0000.h5"):
         (out / name).unlink()
     plan = json.loads((out / "plan.json").read_text())
@@ -50,25 +56,76 @@ def test_only_works_on_a_part_of_a_folder_that_was_begun_for_everything(front, t
     assert part.statuses == {"prepared": 1} and part.report["rooms"][0]["room_id"] == asked
     assert asked in rooms_of(out)
     assert not (out / "index.json").exists() and not (out / "report.json").exists()
-    with pytest.raises(InputError, match=r"--only house/attic selects no room of the plan"):
+    with refused("engine/only of no room of the plan"):
         build_shards(front_job(front, out, only="house/attic"))
-    with pytest.raises(InputError, match=r"\(seed differ\)"):
-        build_shards(front_job(front, out, only=asked, seed=1))
     assert build_shards(front_job(front, out)).shards_made == 1
     assert digests(out) == expected
     # The other way round it is another job.
     alone = tmp_path / "alone"
     build_shards(front_job(front, alone, only=asked))
-    with pytest.raises(InputError, match=r"begun with other settings \(only differ\)"):
+    with refused("engine/everything in a folder of a part", tmp=tmp_path):
         build_shards(front_job(front, alone))
 
 
-def test_a_finished_folder_is_left_as_it_is(front, tmp_path):
-    """Not one file is written again, so it may be read-only."""
+@pytest.mark.parametrize(
+    ("only", "room_id", "house", "asked"),
+    [
+        (None, "abc_Bedroom-1", "abc", True),
+        ("abc", "abc_Bedroom-1", "abc", True),
+        ("ab", "abc_Bedroom-1", "abc", True),
+        ("b", "abc_Bedroom-1", "abc", False),
+        ("abc_Bedroom-1", "abc_Bedroom-1", "abc", True),
+        ("ab/Bedroom-1", "abc_Bedroom-1", "abc", True),
+        ("ab/Bedroom", "abc_Bedroom-1", "abc", False),
+        ("scene0000_00", "scene0000_00", "scene0000_00", True),
+    ],
+)
+def test_only_names_a_house_or_a_room(only, room_id, house, asked):
+    assert is_asked_for(only, room_id, house) == asked
+    assert house_may_match(only, house) or not asked
+
+
+def test_a_seeded_split_keeps_its_order_and_takes_val_from_training_rooms():
+    ids = [f"room{k}" for k in range(40)]
+    two, three = seeded_split(ids, 0), seeded_split(ids, 0, val_share=0.1)
+    assert two == seeded_split(ids[::-1], 0) != seeded_split(ids, 1)
+    assert Counter(three.values()) == {"train": 32, "val": 4, "test": 4}
+    assert all(two[room] == split for room, split in three.items() if split != "val")
+    # A smaller data set draws its test rooms from the same order.
+    tests = {room_id for room_id in ids if two[room_id] == "test"}
+    fewer = seeded_split([*sorted(tests), *sorted(set(ids) - tests)[:16]], 0)
+    assert {room_id for room_id, name in fewer.items() if name == "test"} < tests
+    # Of a few rooms each split has one, as long as one is left to train on.
+    few = Counter(seeded_split(ids[:3], 0, val_share=0.1).values())
+    assert few == {"train": 1, "val": 1, "test": 1}
+    assert seeded_split(["alone"], 0) == {"alone": "train"}
+    assert set(seeded_split(ids, 0, test_share=0).values()) == {"train"}
+
+
+def test_splits(front, tmp_path):
     three_houses(front)
-    out = tmp_path / "shards"
-    build_shards(front_job(front, out))
-    times = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
-    build_shards(front_job(front, out))
-    build_shards(front_job(front, out, only="house1"))
-    assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == times
+    path = tmp_path / "splits.csv"
+
+    def split_sizes(name, text):
+        path.write_text(text)
+        counts = build_shards(front_job(front, tmp_path / name, splits=path)).counts
+        return [counts[split]["rooms"] for split in ("train", "val", "test")]
+
+    text = "instanceid,split\nBedroom-0,train\nhouse0_MasterBedroom-0,test\nBedroom-1,val\n"
+    assert split_sizes("a", f"{text}MasterBedroom-1,test\n") == [1, 1, 2]
+    assert split_sizes("b", "Bedroom-0,train\n") == [1, 0, 0]  # enough to train on
+    for name, text in (("no train", "Bedroom-0,test\n"), ("no rows", "nothing\n")):
+        with refused(f"engine/splits with {name}", tmp=tmp_path):
+            split_sizes("e", text)
+    assert not (tmp_path / "e").exists()  # nothing half-written
+    with refused("engine/no splits", tmp=tmp_path):
+        build_shards(front_job(front, tmp_path / "g", splits=tmp_path / "none.csv"))
+
+
+def test_nothing_passes(front, tmp_path):
+    front.house("house", room("Bedroom-1", [{"jid": "bed", "pos": (0, 0, 0)}]))
+    with refused("engine/no room passes", tmp=tmp_path):
+        build_shards(front_job(front, tmp_path / "shards"))
+    with refused("engine/only of no house", tmp=tmp_path):
+        build_shards(front_job(front, tmp_path / "shards", only="nowhere"))
+    assert not (tmp_path / "shards").exists()
