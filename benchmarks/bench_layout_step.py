@@ -16,10 +16,6 @@ other load affects all; values are medians. On a busy machine, rely on CPU time 
 """
 
 import argparse
-import json
-import os
-import platform
-import statistics
 import sys
 import time
 from collections.abc import Callable
@@ -29,7 +25,7 @@ from typing import Any, TypeVar
 from unittest import mock
 
 import torch
-from bench_boxes import SIZE, make_batch
+from harness import machine, medians, report
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -45,9 +41,25 @@ from sceneprior.training.steps import weighted_sum
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from references.scene_decoder import unroll
 
+SIZE = (480, 640)
 CLASSES = 22
 CONFIG = Path(__file__).parents[1] / "configs" / "paper/bedroom.yaml"
 Batch = TypeVar("Batch", SceneViews, DecodedScenes)
+
+
+def make_batch(rooms: int, views: int, objects: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Centres, sizes, poses and intrinsics in 5 m rooms, with some objects behind the camera."""
+    generator = torch.Generator().manual_seed(0)
+    centers = torch.rand(rooms, objects, 3, generator=generator) * 5 - 2.5
+    sizes = torch.rand(rooms, objects, 3, generator=generator) * 1.5 + 0.2
+    turn = torch.linalg.qr(torch.randn(rooms, views, 3, 3, generator=generator))[0]
+    cameras = torch.eye(4).repeat(rooms, views, 1, 1)
+    cameras[..., :3, :3] = turn * torch.linalg.det(turn)[..., None, None]
+    cameras[..., :3, 3] = torch.randn(rooms, views, 3, generator=generator)
+    intrinsics = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]).expand(
+        rooms, views, 3, 3
+    )
+    return centers.requires_grad_(), sizes.requires_grad_(), cameras, intrinsics
 
 
 def make_views(rooms: int, views: int, objects: int) -> SceneViews:
@@ -150,19 +162,17 @@ def step_ratio(
     logits = torch.randn(rooms, config.model.logits_per_room, requires_grad=True)
     optimizer = torch.optim.Adam([*prior.parameters(), logits], lr=1e-4, fused=True)
 
-    def seconds(step: Step) -> tuple[float, float]:
-        optimizer.zero_grad()
-        start, used = time.perf_counter(), time.process_time()
-        step(prior, prior.latent_space(logits), batch, config)
-        optimizer.step()
-        return time.perf_counter() - start, time.process_time() - used
+    def taken(step: Step) -> Callable[[], None]:
+        def once() -> None:
+            optimizer.zero_grad()
+            step(prior, prior.latent_space(logits), batch, config)
+            optimizer.step()
+
+        return once
 
     steps = {"ours": our_step, "plain": plain_step, "theirs": their_step}
-    times = [[seconds(step) for step in steps.values()] for _ in range(repeats + 1)][1:]
-    clock, used = (
-        {name: statistics.median(turn[i][kind] for turn in times) for i, name in enumerate(steps)}
-        for kind in (0, 1)
-    )
+    calls = {name: taken(step) for name, step in steps.items()}
+    clock, used = (medians(calls, repeats, by) for by in (time.perf_counter, time.process_time))
     with FlopCounterMode(display=False) as counter:
         our_step(prior, prior.latent_space(logits), batch, config)
     found = {"products_s": counter.get_total_flops() / product_rate()}
@@ -180,10 +190,5 @@ if __name__ == "__main__":
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--json", type=Path, help="also write the numbers to this file")
     options = parser.parse_args()
-    print(f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, ", end="")
-    print(f"torch {torch.__version__} on {torch.get_num_threads()} threads")
-    result = step_ratio(options.rooms, objects=options.objects, repeats=options.repeats)
-    for name, value in result.items():
-        print(f"{name:16} {value:8.3f}")
-    if options.json:
-        options.json.write_text(json.dumps(result, indent=2) + "\n")
+    found = step_ratio(options.rooms, objects=options.objects, repeats=options.repeats)
+    report(machine() | found, options.json)

@@ -12,10 +12,7 @@
 """
 
 import argparse
-import json
 import os
-import resource
-import statistics
 import struct
 import subprocess
 import sys
@@ -27,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from harness import children_cpu_s, machine, medians, report
 
 from sceneprior.core.cameras import Pinhole, look_at
 from sceneprior.core.errors import InputError
@@ -72,15 +70,12 @@ def ids(repeats: int = 9) -> dict[str, Any]:
     images = {
         kind: one.instance_ids_of_views(meshes, cameras, SIZE) for kind, one in renderers.items()
     }
-    times: dict[str, list[float]] = {kind: [] for kind in renderers}
-    for _ in range(repeats):
-        for kind, one in renderers.items():
-            before = time.process_time()
-            one.instance_ids_of_views(meshes, cameras, SIZE)
-            times[kind].append(1000 * (time.process_time() - before) / VIEWS)
-    for kind, values in times.items():
-        found[f"{kind}_ms"] = statistics.median(values)
-        found[f"{kind}_least_ms"] = min(values)
+    steps = {
+        kind: partial(one.instance_ids_of_views, meshes, cameras, SIZE)
+        for kind, one in renderers.items()
+    }
+    for kind, seconds in medians(steps, repeats, time.process_time).items():
+        found[f"{kind}_ms"] = 1000 * seconds / VIEWS
         found[f"{kind}_name"] = renderers[kind].name
     if len(images) == 2:
         found["pixels_agree"] = float((images["software"] == images["pyrender"]).mean())
@@ -98,21 +93,16 @@ def workers(rooms: int) -> dict[str, float]:
         homes = Path(name) / "homes"
         _sceneprior("make-homes", homes, "--rooms", rooms)
         for count, word in ((1, "one"), (2, "two")):
-            wall, cpu = time.perf_counter(), _cpu_seconds_of_children()
+            wall, cpu = time.perf_counter(), children_cpu_s()
             _sceneprior(
                 "prep-front", "--front", homes / "3D-FRONT", "--future", homes / "3D-FUTURE-model",
                 "--out", Path(name) / str(count), "--renderer", "software", "--workers", count,
             )  # fmt: skip
             found[f"workers_{word}_s"] = time.perf_counter() - wall
-            found[f"workers_{word}_cpu_s"] = _cpu_seconds_of_children() - cpu
+            found[f"workers_{word}_cpu_s"] = children_cpu_s() - cpu
     found["workers_two_over_one"] = found["workers_one_s"] / found["workers_two_s"]
     found["workers_bound"] = 2 * found["workers_one_cpu_s"] / found["workers_two_cpu_s"]
     return found
-
-
-def _cpu_seconds_of_children() -> float:
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
 
 
 def sens(
@@ -185,14 +175,11 @@ def main() -> None:
         "workers": partial(workers, arguments.rooms),
         "sens": sens,
     }
-    figures: dict[str, Any] = {"cores": os.cpu_count()}
+    figures: dict[str, Any] = machine()
     for name in arguments.only:
         figures[f"{name}_load_average"] = os.getloadavg()[0]
         figures |= parts[name]()
-    for key, value in figures.items():
-        print(f"{key:24}", f"{value:.4g}" if isinstance(value, float) else value)
-    if arguments.json:
-        arguments.json.write_text(json.dumps(figures, indent=2) + "\n")
+    report(figures, arguments.json)
 
 
 if __name__ == "__main__":

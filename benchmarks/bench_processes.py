@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from bench_boxes import processor
+from harness import machine, report
 from lightning.pytorch.strategies import DDPStrategy, StrategyRegistry
 from timed_fit import made_shards, paper_run, timed_fit
 from torch import distributed as dist
@@ -155,7 +155,6 @@ def main() -> None:
     if arguments.child:
         _train(arguments)
         return
-    print(f"{processor()}, load {os.getloadavg()[0]:.1f}; torch {torch.__version__}")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         shards = arguments.shards or made_shards(folder, arguments.rooms, os.cpu_count() or 1)
@@ -163,12 +162,8 @@ def main() -> None:
             shards.absolute(), folder / "runs", arguments.device, arguments.epochs,
             arguments.repeats, tuple(arguments.set),
         )  # fmt: skip
-    for stage, figures in found.items():
-        for name, value in figures.items():
-            shown = f"{value:,}" if isinstance(value, int) else f"{value:.4g}"
-            print(f"{stage:8}{name:28}{shown}")
-    if arguments.json:
-        arguments.json.write_text(json.dumps(found, indent=2) + "\n")
+    rows = {f"{stage} {name}": v for stage, part in found.items() for name, v in part.items()}
+    report(machine() | rows, arguments.json)
 
 
 if __name__ == "__main__":

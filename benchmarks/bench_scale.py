@@ -17,7 +17,6 @@ import argparse
 import json
 import math
 import os
-import statistics
 import subprocess
 import sys
 import tempfile
@@ -117,6 +116,7 @@ def layout_steps(_: Path) -> dict[str, float]:
     """Median CPU seconds of a layout step, by the number of objects."""
     import torch
     from bench_layout_step import make_views, our_step
+    from harness import medians
 
     from sceneprior.apps.config import load_config
     from sceneprior.paper.config import PaperConfig
@@ -128,13 +128,12 @@ def layout_steps(_: Path) -> dict[str, float]:
         assert isinstance(config, PaperConfig)
         prior, views = config.build_prior(), make_views(ROOMS, 20, objects)
         logits = torch.randn(ROOMS, config.model.logits_per_room)
-        times = []
-        for _repeat in range(4):
+
+        def step(prior=prior, views=views, config=config, logits=logits) -> None:
             prior.zero_grad()
-            began = time.process_time()
             our_step(prior, prior.latent_space(logits), views, config)
-            times.append(time.process_time() - began)
-        found[str(objects)] = statistics.median(times[1:])
+
+        found[str(objects)] = medians({"step": step}, 3, time.process_time)["step"]
     return found
 
 
@@ -165,7 +164,7 @@ def main() -> None:
         name, shards = arguments.part
         print(json.dumps(PARTS[name](Path(shards))))
         return
-    figures: dict[str, Any] = {"cores": os.cpu_count(), "load_average": os.getloadavg()[0]}
+    figures: dict[str, Any] = {"cores": os.cpu_count(), "load": os.getloadavg()[0]}
     with tempfile.TemporaryDirectory() as name:
         folder = arguments.folder or Path(name)
         by_rooms = {count: data_set(folder / str(count), count) for count in arguments.rooms}

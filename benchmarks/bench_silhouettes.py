@@ -3,7 +3,7 @@
     python benchmarks/bench_silhouettes.py [--json FILE]
 
 The script measures the exact and the fast mode on the CPU (`gpu.py` measures a GPU), the torch
-reference, the closed-form boxes, and PyTorch3D if it is installed. Values are medians of
+reference, and PyTorch3D if it is installed. Values are medians of
 alternating runs, so that other load affects all equally; ratios are between medians of one run.
 Compilation is reported separately and not included in medians.
 """
@@ -12,18 +12,15 @@ import argparse
 import importlib.util
 import json
 import os
-import platform
-import statistics
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from bench_boxes import boxes_ratio
+from harness import machine, medians, report
 
 from sceneprior.core.cameras import look_at
 from sceneprior.core.meshes import icosphere
@@ -67,19 +64,6 @@ def forward_backward(room: dict[str, Any], **options: Any) -> Callable[[], None]
             torch.cuda.synchronize()
 
     return step
-
-
-def medians(steps: dict[str, Callable[[], None]], repeats: int) -> dict[str, float]:
-    """Median seconds of each step; the steps alternate."""
-    times: dict[str, list[float]] = {name: [] for name in steps}
-    for step in steps.values():
-        step()
-    for _ in range(repeats):
-        for name, step in steps.items():
-            start = time.perf_counter()
-            step()
-            times[name].append(time.perf_counter() - start)
-    return {name: statistics.median(values) for name, values in times.items()}
 
 
 def reference_seconds() -> float:
@@ -191,22 +175,6 @@ def pytorch3d_step(room: dict[str, Any]) -> Callable[[], None]:
     return step
 
 
-def machine() -> dict[str, Any]:
-    """Description of the machine and the software."""
-    model = platform.processor() or platform.machine()
-    info = Path("/proc/cpuinfo")
-    if info.is_file():
-        names = [line for line in info.read_text().splitlines() if line.startswith("model name")]
-        model = names[0].split(":", 1)[1].strip() if names else model
-    return {
-        "cpu": model,
-        "cores": len(os.sched_getaffinity(0)),
-        "torch_threads": torch.get_num_threads(),
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-    }
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--json", type=Path, help="also write the numbers to this file")
@@ -216,11 +184,9 @@ def main() -> None:
 
     def note(**found: Any) -> None:
         figures.update(found)
-        for name, value in found.items():
-            shown = f"{value:.4g}" if isinstance(value, float) else value
-            print(f"{name:32s} {shown}", flush=True)
+        report(found, None)
 
-    note(machine=machine())
+    note(**machine())
     steps = {
         f"{mode}{tag}": forward_backward(furnished_room(level), mode=mode)
         for mode in ("exact", "fast")
@@ -231,7 +197,6 @@ def main() -> None:
     note(fast_ratio=times["exact"] / times["fast"])
     for mode in ("exact", "fast"):
         note(**{f"{mode}_5120_over_1280": times[f"{mode}_5120"] / times[mode]})
-    note(boxes_ratio=boxes_ratio()["ratio"])
     for mode in ("exact", "fast"):
         note(**{f"{mode}_alone_peak_extra_mib": peak_extra_mib(mode=mode, compositing="alone")})
         note(**{f"{mode}_first_call_s": first_call_seconds(mode)})

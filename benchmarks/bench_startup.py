@@ -11,13 +11,14 @@ after an installation, and compiles the rendering kernels. On a busy machine, re
 import argparse
 import json
 import os
-import resource
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 from statistics import median
+
+from harness import children_cpu_s
 
 REPEATS = 3
 PORT = "8089"
@@ -57,7 +58,7 @@ def timed(*arguments: str, new_kernels: bool = False, until_said: bool = False) 
         with tempfile.TemporaryDirectory() as folder:
             command = [sys.executable, *(a.replace("ROOMS", f"{folder}/rooms") for a in arguments)]
             kernels = {"NUMBA_CACHE_DIR": f"{folder}/kernels"} if new_kernels else {}
-            wall, cpu = time.perf_counter(), _children_s()
+            wall, cpu = time.perf_counter(), children_cpu_s()
             process = subprocess.Popen(
                 command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
                 env=os.environ | kernels,
@@ -72,13 +73,8 @@ def timed(*arguments: str, new_kernels: bool = False, until_said: bool = False) 
                 process.communicate()
                 assert process.returncode == 0, command
                 walls.append(time.perf_counter() - wall)
-            cpus.append(_children_s() - cpu)
+            cpus.append(children_cpu_s() - cpu)
     return {"wall_s": round(median(walls), 2), "cpu_s": round(median(cpus), 2)}
-
-
-def _children_s() -> float:
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
 
 
 if __name__ == "__main__":

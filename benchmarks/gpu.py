@@ -26,11 +26,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import gpu_silhouettes
-import gpu_training
+import gpu_parts
 import torch
-from bench_silhouettes import machine
-from gpu_setup import PAPER, TINY, Setup, Sizes
+from gpu_parts import PAPER, TINY, Setup, Sizes
+from harness import machine
 
 
 class Part(NamedTuple):
@@ -42,14 +41,14 @@ class Part(NamedTuple):
 
 
 PARTS = {
-    "kernels": Part(gpu_silhouettes.kernels, 3, "Silhouette kernels against the reference"),
-    "homes": Part(gpu_training.homes, 3, "Homes to train on"),
-    "schedule": Part(gpu_training.schedule, 8, "The paper's run"),
-    "speed": Part(gpu_silhouettes.speed, 4, "Silhouettes"),
-    "peers": Part(gpu_silhouettes.peers, 2, "Silhouettes beside other renderers, one room"),
-    "precision": Part(gpu_training.precision, 8, "Precision"),
-    "batches": Part(gpu_training.batches, 5, "A larger batch"),
-    "processes": Part(gpu_training.processes, 7, "Two processes on one device"),
+    "kernels": Part(gpu_parts.kernels, 3, "Silhouette kernels against the reference"),
+    "homes": Part(gpu_parts.homes, 3, "Homes to train on"),
+    "schedule": Part(gpu_parts.schedule, 8, "The paper's run"),
+    "speed": Part(gpu_parts.speed, 4, "Silhouettes"),
+    "peers": Part(gpu_parts.peers, 2, "Silhouettes beside other renderers, one room"),
+    "precision": Part(gpu_parts.precision, 8, "Precision"),
+    "batches": Part(gpu_parts.batches, 5, "A larger batch"),
+    "processes": Part(gpu_parts.processes, 7, "Two processes on one device"),
 }
 """The parts in order of importance; their limits add up to 40 minutes."""
 

@@ -4,9 +4,9 @@ import json
 from pathlib import Path
 
 import gpu
-import gpu_training
+import gpu_parts
 import pytest
-from gpu_setup import TINY, Setup
+from gpu_parts import TINY, Setup
 
 ON_CPU = ["--device", "cpu", "--tiny"]
 
@@ -28,7 +28,7 @@ def folder(tmp_path_factory, toy_shards: Path) -> Path:
 
 
 def test_the_schedule_is_extrapolated(folder: Path):
-    rows = Notes(gpu_training.schedule, folder)
+    rows = Notes(gpu_parts.schedule, folder)
     layout, shape, whole = rows.values()
     for stage, epochs in ((layout, 800), (shape, 500)):
         assert 0 < stage["step_s"] < stage["epoch_s"] < stage["first_epoch_s"] * 100

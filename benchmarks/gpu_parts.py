@@ -1,27 +1,98 @@
-"""Correctness and speed of silhouettes on a device; parts of `gpu.py`."""
+"""Parts of `gpu.py`: correctness and speed of silhouettes on a device; and steps, memory, precision,
+the whole schedule and two processes of the paper's run on procedural homes."""
 
 import importlib.util
+import os
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import torch
+from bench_processes import compare
 from bench_silhouettes import (
     OBJECTS,
     SIZE,
     VIEWS,
     forward_backward,
     furnished_room,
-    medians,
     pytorch3d_step,
 )
-from gpu_setup import Setup, peak_mib
+from harness import medians
+from timed_fit import CONFIG, StageTimes, made_shards, paper_run, timed_fit
 from torch import Tensor
 
+from sceneprior.apps.config import load_config
 from sceneprior.core.cameras import project
+from sceneprior.core.settings import find_config
 from sceneprior.render.silhouettes import render_scene
 from sceneprior.render.silhouettes.render import COMPOSITING, MODES
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Sizes of the measurements."""
+
+    compared_level: int = 2
+    """Level of the icospheres in the comparison with the reference; 2 has 320 faces."""
+    compared_objects: int = 3
+    compared_views: int = 2
+    compared_shrink: int = 2
+    """Divisor of the image size, 120 x 90, in that comparison."""
+    levels: tuple[int, ...] = (3, 4)
+    """Levels of the icospheres that are timed: 1,280 faces, and the paper's 5,120."""
+    rooms: int = 16
+    """Rooms per batch, for timing silhouettes and for training the paper's run."""
+    large_batch: int = 128
+    """Rooms per batch of an additional run, for memory."""
+    repeats: int = 15
+    homes: int = 96
+    """Procedural homes, 67 of them for training: 268 rows with their turned copies."""
+    epochs: int = 5
+    changes: tuple[str, ...] = ()
+    """Changes to the paper's config."""
+
+
+PAPER = Sizes()
+TINY = Sizes(
+    compared_level=1, compared_objects=2, compared_views=1, compared_shrink=6, levels=(0,), rooms=2,
+    large_batch=4, repeats=1, homes=6, epochs=3,
+    changes=(
+        "model.width=16", "model.decoder.heads=2", "model.decoder.hidden=16", "data.workers=0",
+        "model.latent_space.anchors=10", "model.shape.width=8", "model.shape.level=1",
+        "data.views_per_room=2", "layout.cpu_threads=1", "shape.cpu_threads=1",
+    ),
+)  # fmt: skip
+"""Sizes for a test on a CPU."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Settings with which a part is called."""
+
+    device: str
+    sizes: Sizes
+    folder: Path
+    """Folder shared by all parts, which keeps the homes."""
+    note: Callable[[str, dict[str, float]], None]
+    """Function that immediately writes a row of the part's table, from the row's title and values
+    by name; names end in units."""
+
+
+@contextmanager
+def peak_mib(device: str) -> Iterator[Callable[[], float]]:
+    """Yield a function that returns the peak MiB of tensors on the GPU since entry; 0 on a CPU."""
+    if device == "cpu":
+        yield lambda: 0.0
+        return
+    torch.cuda.empty_cache()
+    torch.cuda.reset_peak_memory_stats()
+    yield lambda: torch.cuda.max_memory_allocated() / 2**20
+
 
 SIGMA_PX2 = 0.25
 """A sigma that float32 represents exactly, since compiled kernels round sigma to float32."""
@@ -146,3 +217,84 @@ def nvdiffrast_step(room: dict[str, Any]) -> Callable[[], None]:
         torch.cuda.synchronize()
 
     return step
+
+
+PAPER_ROOMS = 3530
+"""Number of the paper's training bedrooms: 90% of 3,922."""
+PRECISIONS = {
+    "float32": ("32-true", "highest"),
+    "TF32, as `fit` does": ("32-true", "high"),
+    "bf16-mixed, TF32 beside it": ("bf16-mixed", "high"),
+}
+
+
+def homes(setup: Setup) -> None:
+    """Make homes and prepare their shards, on the CPU."""
+    start = time.perf_counter()
+    made_shards(setup.folder, setup.sizes.homes, len(os.sched_getaffinity(0)))
+    seconds = time.perf_counter() - start
+    setup.note("homes made and prepared", {"homes": setup.sizes.homes, "seconds": seconds})
+
+
+def schedule(setup: Setup) -> None:
+    """Time a few epochs of the paper's run; extrapolate to the whole schedule."""
+    whole = load_config(str(find_config(CONFIG)))
+    epochs = {stage.name: stage.settings.epochs for stage in whole.stages()}
+    config = paper_run(_shards(setup), setup.sizes.epochs, *_changes(setup, setup.sizes.rooms))
+    hours: dict[str, float] = {}
+
+    def ended(stage: str, times: StageTimes) -> None:
+        hours[stage] = whole_epochs_s(times, epochs[stage], whole.data.rotations) / 3600
+        what = f"{stage} stage; whole: {epochs[stage]} epochs"
+        setup.note(what, times.figures() | {"whole_h": hours[stage]})
+
+    with tempfile.TemporaryDirectory() as name:
+        options = {"accelerator": setup.device, "devices": 1}
+        timed_fit(config, Path(name) / "run", options, ended=ended)
+    what = f"all of {CONFIG} on {PAPER_ROOMS:,} rooms, extrapolated"
+    setup.note(what, {"whole_h": sum(hours.values())})
+
+
+def whole_epochs_s(times: StageTimes, epochs: int, rotations: int) -> float:
+    """Seconds of `epochs` epochs on the paper's rooms, extrapolated at equal time per row."""
+    return epochs * times.epoch_s * PAPER_ROOMS * rotations / times.rooms
+
+
+def batches(setup: Setup) -> None:
+    """Time the steps with more rooms per batch."""
+    batch = setup.sizes.large_batch
+    _time(setup, f"{batch} rooms per batch", "32-true", "high", batch)
+
+
+def precision(setup: Setup) -> None:
+    """Time both stages in each precision."""
+    for name, (bits, matmul) in PRECISIONS.items():
+        _time(setup, name, bits, matmul, setup.sizes.rooms)
+
+
+def _time(setup: Setup, what: str, bits: str, matmul: str, batch: int) -> None:
+    def ended(stage: str, times: StageTimes) -> None:
+        setup.note(f"{stage} stage, {what}", times.figures())
+
+    config = paper_run(_shards(setup), setup.sizes.epochs, *_changes(setup, batch))
+    options = {"accelerator": setup.device, "devices": 1, "precision": bits}
+    with tempfile.TemporaryDirectory() as name:
+        timed_fit(config, Path(name) / "run", options, matmul, ended=ended)
+
+
+def processes(setup: Setup) -> None:
+    """Compare two processes, which share each batch and the device, with one."""
+    shards, sizes = _shards(setup), setup.sizes
+    with tempfile.TemporaryDirectory() as name:
+        changes = _changes(setup, sizes.rooms)
+        found = compare(shards, Path(name), setup.device, sizes.epochs, 1, changes)
+    for stage, figures in found.items():
+        setup.note(f"{stage} stage", figures)
+
+
+def _shards(setup: Setup) -> Path:
+    return made_shards(setup.folder, setup.sizes.homes, len(os.sched_getaffinity(0))).absolute()
+
+
+def _changes(setup: Setup, batch: int) -> tuple[str, ...]:
+    return (*setup.sizes.changes, f"layout.batch_size={batch}", f"shape.batch_size={batch}")
