@@ -1,5 +1,5 @@
-"""Parts of `gpu.py`: correctness and speed of silhouettes on a device; and steps, memory, precision,
-the whole schedule and two processes of the paper's run on procedural homes."""
+"""Parts of `gpu.py`: correctness and speed of silhouettes; steps, memory, precision, whole schedule
+and two processes of the paper's run on procedural homes."""
 
 import importlib.util
 import os
