@@ -8,14 +8,11 @@ import numpy as np
 import torch
 from jaxtyping import Int
 
-from sceneprior.core.cameras import boxes_of_points
 from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.dataset import ViewDataset, allowed_views
 from sceneprior.core.errors import InputError
-from sceneprior.core.meshes import place
 from sceneprior.core.scene import Scene
 from sceneprior.core.shards import iterate_rooms, list_shards
-from sceneprior.core.views import SceneViews
 from sceneprior.evaluation.metric import METHOD, Estimate, emptiness, mean_of_rooms, resample_counts
 from sceneprior.evaluation.metrics import METRICS
 from sceneprior.evaluation.metrics.contents import (
@@ -27,10 +24,8 @@ from sceneprior.evaluation.metrics.contents import (
 from sceneprior.evaluation.metrics.overlaps import room_overlaps
 from sceneprior.evaluation.synthesis import EvalOptions, result_of
 from sceneprior.paper.config import PaperConfig
-from sceneprior.paper.matching import match_objects
+from sceneprior.paper.fit_image import decode_images, view_loss
 from sceneprior.paper.prior import TrainedPrior
-from sceneprior.paper.shape_decoder import ShapeDecoder
-from sceneprior.render.silhouettes.render import render_scene
 
 VIEWS = 4
 """Number of views per training room in which decoded masks are compared."""
@@ -94,16 +89,17 @@ def evaluate_from_views(
     }
 
 
+@torch.no_grad()
 def mask_scores(trained: TrainedPrior, shards: Path) -> dict[str, float]:
-    """Mean IoU of the masks of decoded training rooms with the observed masks.
+    """Mean soft IoU of the masks of decoded training rooms with the observed masks, as in training.
 
     The key is `mask_iou_held_out` if `data.view_fraction` holds views of every room out of
     training; the IoU is then computed in such views. Otherwise it is computed in training views,
-    and the key is `mask_iou_training_views`. Empty for methods other than `paper`, whose shapes
-    need not be meshes.
+    and the key is `mask_iou_training_views`. Empty for runs that decode no meshes: those of methods
+    other than `paper`, and those before the shape stage.
     """
     config = trained.config
-    if not isinstance(config, PaperConfig):
+    if not isinstance(config, PaperConfig) or trained.stage == "layout":
         return {}
     data = config.data
     fewest = min(len(shard.read_room(r).visible) for shard, r in iterate_rooms(shards, "train"))
@@ -121,43 +117,12 @@ def mask_scores(trained: TrainedPrior, shards: Path) -> dict[str, float]:
     rows = range(0, len(rooms), rooms.rotations)
     for start in range(0, len(rows), _BATCH):
         views = rooms.__getitems__([(row, 0) for row in rows[start : start + _BATCH]])
-        seen = int(views.visible.sum())
-        if seen:
-            total, pairs = total + seen * mask_iou_of_rooms(trained, views), pairs + seen
+        points = trained.prior.latent_space(trained.logits[views.room_index])
+        found = view_loss(trained, decode_images(trained, points, views), views)
+        seen = views.visible.sum(dim=(1, 2))
+        total, pairs = total + float((found.mask_iou * seen).sum()), pairs + int(seen.sum())
     key = "mask_iou_held_out" if held_out else "mask_iou_training_views"
     return {key: total / pairs} if pairs else {}
-
-
-@torch.no_grad()
-def mask_iou_of_rooms(trained: TrainedPrior, views: SceneViews) -> float:
-    """Mean IoU of hard masks of decoded training rooms with the observed ones; void is left out.
-
-    The network decodes meshes; before the shape stage, each box is filled by the shape template.
-    """
-    config, prior = trained.config, trained.prior
-    assert isinstance(config, PaperConfig), "a run that remembers rooms has a view loss"
-    weights = config.loss
-    scenes = prior(trained.logits[views.room_index], with_shape=trained.stage != "layout")
-    shape, vertices = prior.shape, scenes.vertices_m
-    assert isinstance(shape, ShapeDecoder), "masks are drawn of meshes"
-    if vertices is None:
-        template = shape.template.expand(*scenes.centers_m.shape[:2], -1, -1)
-        vertices = place(template, scenes.centers_m, scenes.sizes_m)
-    boxes = boxes_of_points(vertices, views.world_to_camera, views.intrinsics, views.image_size)
-    matches = match_objects(scenes, boxes, views, weights.match_box, weights.occlusion_slack)
-    ids = views.observed_ids
-    height, width = ids.shape[-2:]
-    counts = views.is_object.sum(dim=-1, keepdim=True)
-    front = render_scene(
-        vertices, shape.faces, views.world_to_camera, views.intrinsics_at(height, width),
-        (height, width), mode="fast", drawn=torch.arange(vertices.shape[1]) < counts,
-    ).front  # fmt: skip
-    room, view, item = (views.visible & matches.valid.unsqueeze(1)).nonzero(as_tuple=True)
-    mine = front[room, view] == matches.prediction[room, item][:, None, None]
-    mine &= views.known_pixels[room, view]
-    seen = ids[room, view] == (item + 1)[:, None, None]
-    both = (mine & seen).sum(dim=(1, 2))
-    return float((both / (mine | seen).sum(dim=(1, 2)).clamp(min=1)).mean())
 
 
 def _counted(shards: Path, split: str, names: str) -> Int[np.ndarray, "rooms classes"]:

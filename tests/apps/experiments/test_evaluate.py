@@ -8,23 +8,17 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
-import torch
 from refusals import refused
 
 from sceneprior.apps.config import load_run
-from sceneprior.apps.experiments.evaluate_views import mask_iou_of_rooms, mask_scores
+from sceneprior.apps.experiments.evaluate_views import mask_scores
 from sceneprior.apps.rooms import write_scenes
 from sceneprior.apps.sample import sample_rooms
-from sceneprior.core.classes import label_set
-from sceneprior.core.dataset import ViewDataset, allowed_views
+from sceneprior.core.dataset import allowed_views
 from sceneprior.core.errors import InputError
-from sceneprior.core.ground_truth import reference_scenes
-from sceneprior.core.meshes import place
 from sceneprior.core.shards import iterate_rooms
-from sceneprior.core.views import DecodedScenes
 from sceneprior.evaluation.metrics.contents import category_kl, class_frequencies
 from sceneprior.paper.sampling import COPIES
-from sceneprior.render.appearance import box_mesh
 
 
 def test_the_users_scenes_are_evaluated(command, scenes, toy_shards, tmp_path):
@@ -169,41 +163,3 @@ def test_views_that_training_never_saw_are_held_out(toy_shards, toy_run):
     assert sorted([*seen, *others]) == list(range(8)) and len(others) == 4
     with pytest.raises(InputError, match="does not hold the training rooms of this run"):
         mask_scores(replace(trained, room_ids=("elsewhere",)), toy_shards)
-
-
-def test_rooms_decoded_as_they_are_have_the_masks_that_were_seen(toy_run, toy_shards, monkeypatch):
-    """Toy rooms are boxes; with boxes for a template only pixels on edges may differ."""
-    cube = box_mesh((0.0, 0.0, 0.0), (2.0, 2.0, 2.0))
-    trained = load_run(toy_run)  # its own, since it is changed
-    shape = trained.prior.shape
-    shape.template = torch.from_numpy(cube.vertices_m).float()
-    shape.faces = torch.from_numpy(cube.faces)
-    rooms = ViewDataset(toy_shards, "train", views_per_room=4, rotations=1, mask_step=1)
-    views = rooms.__getitems__([(row, 0) for row in range(8)])
-    truth = {scene.name: scene for scene in reference_scenes(toy_shards, "train", None, True)}
-    rooms, slots = len(views.room_ids), 6
-    logits = torch.zeros(rooms, slots, len(label_set("front3d_bedroom")))
-    centers, sizes = torch.zeros(rooms, slots, 3), torch.full((rooms, slots, 3), 0.1)
-    for row, name in enumerate(views.room_ids):
-        scene = truth[name]
-        count = len(scene.objects)
-        # In another order than the tracks': matching has to find it out.
-        centers[row, :count] = torch.from_numpy(scene.centers_m).float().flip(0)
-        sizes[row, :count] = torch.from_numpy(scene.sizes_m).float().flip(0)
-        logits[row, range(count), scene.class_indices[::-1].copy()] = 5
-
-    def iou(stage, centers):
-        def decode(logits_, with_shape):
-            template = shape.template.expand(rooms, slots, -1, -1)
-            vertices = place(template, centers, sizes) if with_shape else None
-            return DecodedScenes(logits, centers, sizes, torch.ones(rooms, slots), None, vertices)
-
-        monkeypatch.setattr(trained.prior, "forward", decode)
-        return mask_iou_of_rooms(replace(trained, stage=stage), views)
-
-    for stage in ("layout", "shape"):
-        assert iou(stage, centers) > 0.95
-        assert iou(stage, centers + 0.5) < 0.5
-    # Void hides every other column; what decoded objects would show there is not compared.
-    views.instance_ids[..., ::2] = slots + 1
-    assert iou("shape", centers) > 0.95
