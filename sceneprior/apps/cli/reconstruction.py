@@ -132,7 +132,6 @@ def eval_svr(
     """Evaluate single-view reconstruction, with training rooms as baselines."""
     from sceneprior.apps.reconstruction.reconstruct import FitOptions
     from sceneprior.apps.reconstruction.score import (
-        SvrProtocol,
         evaluate_run,
         evaluate_scenes,
         print_view_scores,
@@ -140,11 +139,10 @@ def eval_svr(
     from sceneprior.core.errors import InputError
     from sceneprior.core.files import write_json
 
-    protocol = SvrProtocol(shards, split, seed, views)
     if run is not None and scenes is None:
         chosen = FitOptions(fit, restarts)
         target = options.result_file(run, out, "svr.json")
-        found = evaluate_run(run, protocol, chosen, limit, models)
+        found = evaluate_run(run, shards, chosen, split, seed, views, limit, models)
     elif scenes is not None and run is None:
         given = (views, limit, fit, restarts, models)
         if given != (1, None, "objects", 1, None):
@@ -153,7 +151,7 @@ def eval_svr(
                 "evaluated as they are."
             )
         target = options.checked_target(out or scenes / "svr.json")
-        found = evaluate_scenes(scenes, protocol)
+        found = evaluate_scenes(scenes, shards, split, seed)
     else:
         raise InputError("Say what to evaluate: either --run, or --scenes with reconstructions.")
     write_json(target, found)

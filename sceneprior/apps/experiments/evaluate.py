@@ -11,7 +11,6 @@ import torch
 from sceneprior.apps.config import load_any_run, run_config
 from sceneprior.apps.experiments.evaluate_views import (
     evaluate_from_views,
-    known_from_views_alone,
     mask_scores,
 )
 from sceneprior.apps.experiments.runs import GIVEN, generated_by
@@ -20,6 +19,7 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.files import write_json
 from sceneprior.core.ground_truth import known_in_3d, reference_scenes
 from sceneprior.core.scene import Scene
+from sceneprior.core.shards import list_shards
 from sceneprior.evaluation.metrics.contents import reconstruction_scores
 from sceneprior.evaluation.report import ROOMS_SHOWN, write_report
 from sceneprior.evaluation.room_sets import seeded_rows
@@ -118,7 +118,9 @@ def _scores(
     against their 3D ground truth or, if the shards have none, against the observed masks. This
     comes first, because it refuses shards that are not the run's.
     """
-    in_3d = shards is not None and not known_from_views_alone(shards, options.split)
+    if shards is not None:
+        list_shards(shards, options.split)  # raises if the split has no rooms
+    in_3d = shards is not None and known_in_3d(shards, options.split)
     keeping = trained if isinstance(trained, TrainedPrior) and trained.remembers_rooms else None
     scores: dict[str, Any] | None = None
     if shards is None or (use is not None and use.alone):

@@ -12,7 +12,7 @@ from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.dataset import ViewDataset, allowed_views
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene
-from sceneprior.core.shards import iterate_rooms, list_shards
+from sceneprior.core.shards import iterate_rooms
 from sceneprior.evaluation.metric import METHOD, Estimate, emptiness, mean_of_rooms, resample_counts
 from sceneprior.evaluation.metrics import METRICS
 from sceneprior.evaluation.metrics.contents import (
@@ -34,12 +34,6 @@ _NOTE = (
     "The rooms of these shards are known from views alone: objects are counted as they appear in "
     "the views, and metrics that need 3D ground truth are left out."
 )
-
-
-def known_from_views_alone(shards: Path, split: str) -> bool:
-    """True if a room of a split lacks 3D ground truth; ShardError if the split has no room."""
-    list_shards(shards, split)
-    return any(not shard.has_ground_truth(room) for shard, room in iterate_rooms(shards, split))
 
 
 def evaluate_from_views(

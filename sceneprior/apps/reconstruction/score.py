@@ -3,7 +3,7 @@
 import time
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -57,41 +57,29 @@ Answers = Sequence[Sequence[SceneObject | None]]
 """Reconstructed objects by image and mask; None for a mask without an object."""
 
 
-@dataclass(frozen=True)
-class SvrProtocol:
-    """Settings for scoring single-view reconstructions."""
-
-    shards: Path
-    """Shards with 3D ground truth; the training-room baselines come from `train`."""
-    split: str = "test"
-    """The split whose rooms are reconstructed."""
-    seed: int = 0
-    """Seed of the random training rooms and, for runs, of the views."""
-    views: int = 1
-    """Number of views drawn from each room to evaluate a run; all if a room has fewer."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """The protocol, for a result file."""
-        told = {"shards": str(self.shards), "split": self.split, "seed": self.seed}
-        return {**told, "points": POINTS, **PROTOCOL}
-
-
 def evaluate_run(
     run: str,
-    protocol: SvrProtocol,
+    shards: Path,
     options: FitOptions,
+    split: str = "test",
+    seed: int = 0,
+    count: int = 1,
     limit: int | None = None,
     models: Path | None = None,
 ) -> dict[str, Any]:
-    """Reconstruct views of each room (or of the first `limit`) and score them.
+    """Reconstruct views of the rooms of a split and score them against their 3D ground truth.
 
     With CAD `models`, the reconstructions are also scored with the objects replaced by retrieved
     models (apps/retrieval).
+
+    Args:
+        seed: Seed of the views and of the random training rooms.
+        count: Number of views drawn from each room; all if a room has fewer.
+        limit: Number of rooms; None takes all.
     """
     trained = load_any_run(run)
-    shards, split = protocol.shards, protocol.split
     reference_scenes(shards, split, limit=1, meshes=False)  # raises before any fit
-    images, blank = images_of_split(shards, split, protocol.seed, limit, protocol.views)
+    images, blank = images_of_split(shards, split, seed, limit, count)
     begin = time.process_time()
     fitted = reconstruct(trained, images, options)
     seconds = time.process_time() - begin
@@ -108,41 +96,41 @@ def evaluate_run(
         plain = reconstruct(trained, images, replace(options, masks=False))
         answers["layout_fit"] = [one.scene.without_meshes().objects for one in plain]
     return {
-        "rows": score_answers(images, answers, protocol),
+        "rows": score_answers(images, answers, shards, split, seed),
         "mask_iou": sum(overlaps) / len(overlaps) if overlaps else None,
         "cpu_seconds_an_image": seconds / len(images),
         "protocol": {
             "run": Path(run).resolve().name,
             "stage": trained.stage,
             "views": "drawn at random from those that show an object",
-            "views_per_room": protocol.views,
+            "views_per_room": count,
             "rooms_without_such_a_view": blank,
             "fit": asdict(options),
             "models": None if models is None else Path(models).resolve().name,
-            "known_model_share": known_model_share(images, shards, split),
-            **protocol.as_dict(),
+            **_protocol(images, shards, split, seed),
         },
     }
 
 
-def evaluate_scenes(folder: Path, protocol: SvrProtocol) -> dict[str, Any]:
+def evaluate_scenes(
+    folder: Path, shards: Path, split: str = "test", seed: int = 0
+) -> dict[str, Any]:
     """Score a folder of reconstructions, as written by `reconstruct` or by `retrieve` after it.
 
     Each scene's `extra` holds its `room_id` and `view`; its objects correspond to the masks of that
     view, in their order.
     """
-    images, scenes = scenes_with_images(folder, protocol.shards, protocol.split)
+    images, scenes = scenes_with_images(folder, shards, split)
     answers: dict[str, Answers] = {
         "scenes": [scene.objects for scene in scenes],
         "scenes_boxes": [scene.without_meshes().objects for scene in scenes],
     }
     return {
-        "rows": score_answers(images, answers, protocol),
+        "rows": score_answers(images, answers, shards, split, seed),
         "protocol": {
             "scenes": str(folder),
             "views": {image.name: image.view for image in images},
-            "known_model_share": known_model_share(images, protocol.shards, protocol.split),
-            **protocol.as_dict(),
+            **_protocol(images, shards, split, seed),
         },
     }
 
@@ -182,19 +170,37 @@ def scenes_with_images(
     return images, scenes
 
 
+def _protocol(
+    images: Sequence[ObservedImage], shards: Path, split: str, seed: int
+) -> dict[str, Any]:
+    """The settings of a result file that scores of runs and of scenes share."""
+    return {
+        "known_model_share": known_model_share(images, shards, split),
+        "shards": str(shards),
+        "split": split,
+        "seed": seed,
+        "points": POINTS,
+        **PROTOCOL,
+    }
+
+
 def score_answers(
-    images: Sequence[ObservedImage], answers: dict[str, Answers], protocol: SvrProtocol
+    images: Sequence[ObservedImage],
+    answers: dict[str, Answers],
+    shards: Path,
+    split: str,
+    seed: int,
 ) -> dict[str, Any]:
     """Scores by row: rows of the given reconstructions, and baseline rows of training rooms."""
-    rooms = known_rooms(protocol.shards)
+    rooms = known_rooms(shards)
     nearest = nearest_answers(rooms, images, SoftwareRenderer())
-    drawn = random_answers(rooms, images, protocol.seed)
+    drawn = random_answers(rooms, images, seed)
     answers = {
         **answers,
         "nearest_room": [one.objects for one in nearest],
         "random_room": [one.objects for one in drawn],
     }
-    true_rooms = reference_scenes(protocol.shards, protocol.split, tracked_only=True)
+    true_rooms = reference_scenes(shards, split, tracked_only=True)
     truth = {scene.name: scene.objects for scene in true_rooms}
     rows = {}
     for name, some in answers.items():
