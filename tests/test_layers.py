@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tomllib
 from functools import cache
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -98,12 +99,16 @@ OWNERS = {
 @cache
 def imports(path: Path) -> set[str]:
     """Full names of every module a file imports, wherever in the file."""
+    return imported(path.read_text())
+
+
+def imported(source: str) -> set[str]:
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{path}: relative imports hide the layer"
+            assert node.level == 0, "relative imports hide the layer"
             found |= {f"{node.module}.{alias.name}" for alias in node.names} | {node.module}
     return found
 
@@ -145,6 +150,21 @@ def test_imports_look_down_only():
             used = {layer_of(module) for module in imports(path)} - {None}
             beyond[name_of(path)] = used - allowed(name_of(path), layer)
     assert not {name: sorted(folders) for name, folders in beyond.items() if folders}
+
+
+def test_no_import_circle():
+    """Imports inside functions count; those for type checkers do not."""
+    modules = {name_of(path).removesuffix(".py").replace("/", "."): path for path in FILES}
+    packages = {name.removesuffix(".__init__") for name in modules if name.endswith("__init__")}
+    graph = {}
+    for name, path in modules.items():
+        run = "\n".join(
+            ast.unparse(node)
+            for node in ast.parse(path.read_text()).body
+            if not (isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING")
+        )
+        graph[name] = (imported(run) & modules.keys()) - packages - {name}
+    TopologicalSorter(graph).prepare()  # raises a CycleError, which names the modules
 
 
 def test_folders_keep_their_budget():
