@@ -86,7 +86,6 @@ def prep_front(
         bool, typer.Option("--rgb", help="Also write shaded pictures, OUT/rgb/ROOM/VIEW.png.")
     ] = False,
     workers: WorkersOption = None,
-    renderer: Annotated[str, typer.Option(help="auto, pyrender or software.")] = "auto",
     only: Annotated[
         str | None, typer.Option(help="One house or room only: HOUSE, HOUSE/ROOM or a room id.")
     ] = None,
@@ -105,7 +104,7 @@ def prep_front(
         changes.append(f"views.per_m2={views_per_m2}")
     rules = load_recipe(recipe, tuple(changes))
     source = FrontSource(front, future, rules, splits, seed, only, rgb)
-    run_job(Job(source, out, workers, renderer, retry_failed))
+    run_job(Job(source, out, workers, retry_failed))
 
 
 def recipe(

@@ -42,7 +42,7 @@ from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
 from sceneprior.core.scene import Mesh
-from sceneprior.render.offscreen.zbuffer import rasterize
+from sceneprior.render.zbuffer import rasterize
 
 TABLE = "scannetv2-labels.combined.tsv"
 _IPHONE = "iphone/pose_intrinsic_imu.json"

@@ -24,7 +24,7 @@ from sceneprior.evaluation.metrics.picture_distances import frechet_distance, ga
 from sceneprior.evaluation.room_sets import seeded_rows
 from sceneprior.evaluation.score_table import headings, print_scores, score_rows
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
-from sceneprior.render.offscreen import SoftwareRenderer
+from sceneprior.render.offscreen import Renderer
 from sceneprior.render.topdown import topdown
 
 
@@ -224,7 +224,7 @@ def test_the_gap_closed_compares_equal_numbers_of_rooms(shards, no_classifier):
 def test_what_cannot_be_scored_is_refused_before_anything_is_drawn(
     generated, shards, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(SoftwareRenderer, "instance_ids", None, raising=True)
+    monkeypatch.setattr(Renderer, "instance_ids", None, raising=True)
     with pytest.raises(InputError, match="at least 2 generated rooms, but there are 1"):
         evaluate_synthesis(generated[:1], shards, EvalOptions())
     with pytest.raises(InputError, match="scenes of one label set"):

@@ -3,7 +3,7 @@
 import numpy as np
 
 from data_prep.readers.scannet.scans import Scan
-from sceneprior.render.offscreen.zbuffer import NEAR_PLANE_M, rasterize
+from sceneprior.render.zbuffer import NEAR_PLANE_M, rasterize
 
 _BEHIND_M = 0.05
 """Minimum depth of a vertex behind the rendered surface to count as occluded; smaller depths occur

@@ -20,7 +20,7 @@ from data_prep.readers.scannet.source import ScanNetSource
 from data_prep.readers.scannet.views import prepare_scan
 from sceneprior.core.shard_writing import room_checksum
 from sceneprior.core.shards import Shard
-from sceneprior.render.offscreen.zbuffer import rasterize
+from sceneprior.render.zbuffer import rasterize
 
 SIZE = (242, 324)
 

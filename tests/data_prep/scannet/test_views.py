@@ -21,7 +21,7 @@ from data_prep.inspection.agreement import box_iou_2d
 from data_prep.readers.scannet.scans import FULL_SIZE, QUARTER_SIZE, ScanSettings, read_scan
 from data_prep.readers.scannet.views import instance_images, prepare_scan
 from sceneprior.core.classes import STUFF, label_set
-from sceneprior.render.offscreen.zbuffer import rasterize
+from sceneprior.render.zbuffer import rasterize
 
 BITS = (np.arange(8)[:, None] >> np.arange(3)) & 1
 NAMES = label_set("scannet")
