@@ -3,11 +3,12 @@
 import os
 import re
 import socket
+import sys
 from pathlib import Path
 
 import pytest
 import typer
-from cli_helpers import everything_in, refuses
+from cli_helpers import everything_in, one_sentence, refuses
 from typer.testing import CliRunner
 
 from sceneprior.apps.cli.commands import app
@@ -120,3 +121,20 @@ def test_what_is_refused_is_one_sentence_and_writes_nothing(key, files, tmp_path
     before = everything_in(tmp_path)
     refuses(files, f"cli/{key}", *words, tmp=tmp_path)
     assert everything_in(tmp_path) == before
+
+
+def test_a_page_needs_its_extra_and_a_free_port(command, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "viser", None)  # what an import finds where there is none
+        refuses(command, "cli/view_without_viser", "view", "run")
+    pytest.importorskip("viser", reason="the extra `view` is not installed")
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        refuses(
+            command, "cli/view_taken_port", "view", "run", "--port", port, port=port,
+            next=port + 1,
+        )  # fmt: skip
+    said = one_sentence(command("view", "run", "--host", "no.such.host.invalid"))
+    assert "of no.such.host.invalid cannot be used" in said

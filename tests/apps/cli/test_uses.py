@@ -1,17 +1,32 @@
-"""interpolate, retrieve and complete as commands: files, and sentences for what does not work."""
+"""Commands that make rooms, and share them: the files that they write, and their notes."""
 
-import errno
+import base64
+import io
 import json
 import os
+import re
+import shutil
+from pathlib import Path
 
 import pytest
 import torch
-from cli_helpers import everything_in, one_sentence
+import trimesh
+from cli_helpers import everything_in, one_sentence, refuses
 from model_folder import corner_sofa, write_models
+from toy_metrics import without_classifiers
 
 from sceneprior.apps.config import load_run
-from sceneprior.core import files
+from sceneprior.apps.priors.packed import shipped_priors
+from sceneprior.apps.rooms import write_scenes
+from sceneprior.core.scene import Scene, SceneObject
+from sceneprior.interchange.export import FORMATS
 from sceneprior.paper import decode
+
+BEDROOM = "front3d_bedroom"
+
+
+def names_in(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
 
 
 @pytest.fixture
@@ -21,100 +36,54 @@ def rooms(command, toy_run, tmp_path):
     return tmp_path / "rooms"
 
 
-def test_empty_rooms_are_written_and_named(command, toy_run, monkeypatch):
-    call = ["synthesize", "--run", toy_run, "-n", 7]
-    status, _, errors = command(*call, "--out", "full")
-    assert status == 0 and "empty" not in errors
-    kept = decode.kept_objects
-
-    def keep(rooms):
-        """Keep the objects of some rooms only."""
-        drawn = torch.zeros(7, 1, dtype=torch.bool)
-        drawn[rooms] = True
-        monkeypatch.setattr(
-            decode, "kept_objects", lambda logits, target: kept(logits, target) & drawn
-        )
-
-    keep([0, 1, 2, 4, 5, 6])
-    status, out, errors = command(*call, "--out", "one")
-    assert (status, out) == (0, "Wrote 7 rooms to one (from: paper)\n")
-    assert errors.strip().splitlines()[-1] == (
-        "Note: 1 of 7 rooms are empty (no object): seed0_0003. Train longer, or on more rooms."
-    )
-    keep([])
-    status, _, errors = command(*call, "--out", "none")
-    assert status == 0 and errors.strip().splitlines()[-1].startswith(
-        "Note: 7 of 7 rooms are empty (no object): seed0_0000, seed0_0001, seed0_0002, seed0_0003, "
-        "seed0_0004 and 2 more. Train"
-    )
-
-
-def test_interpolate(command, toy_run, rooms, tmp_path):
-    first = load_run(toy_run).room_ids[0]
-    call = ["interpolate", "--run", toy_run, "--from", first]
-    end = "rooms/latents.npz:seed0_0002"
-    status, out, errors = command(*call, "--to", end, "--steps", 4, "--out", "way")
-    assert (status, out) == (0, "Wrote 4 rooms, strip.png and animation.gif to way\n"), errors
-    files = {f"step_{k:02d}.{kind}" for k in range(4) for kind in ("json", "glb", "png")}
-    files |= {"overview.png", "strip.png", "animation.gif", "latents.npz"}
-    assert {path.name for path in (tmp_path / "way").iterdir()} == files
-    extra = json.loads((tmp_path / "way" / "step_03.json").read_text())["extra"]
-    assert extra["along"] == 1 and extra["to"] == end and extra["slots"]
+def test_synthesize_writes_rooms_and_the_same_again(command, toy_run, tmp_path):
+    call = ["synthesize", "--run", toy_run, "-n", "3", "--seed", "5"]
+    status, out, _ = command(*call, "--out", "made")
+    assert (status, out) == (0, "Wrote 3 rooms to made (from: paper)\n")
+    names = {f"seed5_000{k}.{kind}" for k in range(3) for kind in ("json", "glb", "png")}
+    assert names_in(tmp_path / "made") == names | {"overview.png", "latents.npz"}
+    scene = json.loads((tmp_path / "made" / "seed5_0000.json").read_text())
+    assert scene["label_set"] == BEDROOM and scene["units"] == "metres"
     before = everything_in(tmp_path)
-    assert "way is not empty" in one_sentence(command(*call, "--to", "seed:1", "--out", "way"))
+    assert command(*call, "--out", "made", "--overwrite", "--html")[0] == 0
+    page = (tmp_path / "made" / "rooms.html").read_text()
+    assert page.count("<model-viewer ") == 3 and "seed 5 · from: paper" in page
+    assert command(*call, "--out", "made", "--overwrite")[0] == 0
     assert everything_in(tmp_path) == before
 
 
-def test_retrieve(command, rooms, tmp_path):
-    write_models(
-        tmp_path / "models",
-        {
-            "bed": ("King-size Bed", corner_sofa()),
-            "ward": ("Wardrobe", corner_sofa()),
-            "gone": ("Desk", corner_sofa()),
-        },
-    )
-    (tmp_path / "models" / "gone" / "raw_model.obj").unlink()
-    call = ["retrieve", "--scenes", "rooms", "--models", "models", "--cache", "cache"]
-    status, out, errors = command(*call, "--out", "cad")
-    assert status == 0, errors
-    assert "1 models are broken; see retrieval.json\nWrote 3 rooms to cad\n" in out
-    report = json.loads((tmp_path / "cad" / "retrieval.json").read_text())
-    assert report["scenes"] == 3 and set(report["broken_models"]) == {"gone"}
-    scene = json.loads((tmp_path / "cad" / "seed0_0000.json").read_text())
-    for item, found in zip(scene["objects"], scene["extra"]["retrieval"], strict=True):
-        models = {"double_bed": "bed", "wardrobe": "ward"}
-        assert (found or {}).get("model_id") == models.get(item["class"])
-    assert (tmp_path / "cad" / "overview.png").is_file()
-    again = command(*call, "--out", "again")
-    assert again[0] == 0
-    assert everything_in(tmp_path / "cad") == everything_in(tmp_path / "again")
-    said = one_sentence(command("retrieve", "--scenes", "cache", *call[3:], "--out", "new"))
-    assert "cache holds no scene JSON" in said and not (tmp_path / "new").exists()
+def test_synthesize_writes_walls_if_asked(command, toy_run, tmp_path):
+    call = ["synthesize", "--run", toy_run, "-n", 1, "--html", "--out"]
+    for shell, nodes in (("walls", {"floor", "wall_0", "ceiling"}), ("none", set())):
+        assert command(*call, shell, "--shell", shell)[0] == 0
+        found = set(trimesh.load_scene(tmp_path / shell / "seed0_0000.glb").graph.nodes_geometry)
+        assert found & {"floor", "wall_0", "ceiling"} == nodes
+        page = (tmp_path / shell / "rooms.html").read_text()
+        (model,) = re.findall('src="data:model/gltf-binary;base64,([^"]+)"', page)
+        model = trimesh.load_scene(io.BytesIO(base64.b64decode(model)), file_type="glb")
+        shown = set(model.graph.nodes_geometry) & {"floor", "wall_0", "ceiling"}
+        assert shown == {"floor"} | nodes  # a page shows the floor in any case
+    pictures = [(tmp_path / shell / "overview.png").read_bytes() for shell in ("walls", "none")]
+    assert pictures[0] != pictures[1]
 
 
-def test_complete(command, toy_run, rooms, tmp_path, monkeypatch):
-    monkeypatch.setattr("sceneprior.lifted.complete.RESTARTS", 1)
-    scene = json.loads((rooms / "seed0_0001.json").read_text())
-    scene["objects"] = scene["objects"][:1]
-    given = tmp_path / "given.json"
-    given.write_text(json.dumps(scene))
-    call = ["complete", "--run", toy_run, "--given", given]
-    status, out, errors = command(*call, "-n", 2, "--out", "whole")
-    assert (status, out) == (
-        0,
-        "Wrote 2 rooms around 1 given object, decoded from fitted latents, to whole\n",
-    ), errors
-    made = json.loads((tmp_path / "whole" / "complete_01.json").read_text())
-    assert made["objects"][0] == scene["objects"][0] and made["extra"]["given"] == [0]
-    assert (tmp_path / "whole" / "overview.png").is_file()
-    # Answers are ends of a path, too.
-    ends = ["--from", "whole/latents.npz:complete_00", "--to", "whole/latents.npz:complete_01"]
-    walk = ["interpolate", "--run", toy_run, *ends, "--steps", 2, "--out", "walk"]
-    assert command(*walk)[0] == 0
-    said = one_sentence(command(*call[:3], "--given", "gone.json", "--out", "many"))
-    assert "gone.json cannot be read (No such file or directory)" in said
-    assert not (tmp_path / "many").exists()
+@pytest.mark.parametrize(
+    ("furnished", "note"),
+    [
+        ([0, 1, 2, 4, 5, 6], "1 of 7 rooms are empty (no object): seed0_0003."),
+        ([], f"7 of 7 rooms are empty (no object): {', '.join(f'seed0_000{k}' for k in range(5))} "
+         "and 2 more."),
+    ],
+)  # fmt: skip
+def test_empty_rooms_are_written_and_named(command, toy_run, monkeypatch, furnished, note):
+    drawn = torch.zeros(7, 1, dtype=torch.bool)
+    drawn[furnished] = True
+    kept = decode.kept_objects
+    monkeypatch.setattr(decode, "kept_objects", lambda *given: kept(*given) & drawn)
+    status, out, errors = command("synthesize", "--run", toy_run, "-n", 7, "--out", "some")
+    assert (status, out) == (0, "Wrote 7 rooms to some (from: paper)\n")
+    last = errors.strip().splitlines()[-1]
+    assert last == f"Note: {note} Train longer, or on more rooms."
 
 
 def test_a_sampler_s_rooms_have_no_latents(command, sampler_run, tmp_path, few_attempts):
@@ -126,10 +95,42 @@ def test_a_sampler_s_rooms_have_no_latents(command, sampler_run, tmp_path, few_a
     assert (tmp_path / "drawn" / "seed0_0001.json").exists()
 
 
+def test_interpolate(command, toy_run, rooms, tmp_path):
+    first = load_run(toy_run).room_ids[0]
+    end = "rooms/latents.npz:seed0_0002"
+    call = ["interpolate", "--run", toy_run, "--from", first, "--to", end]
+    status, out, errors = command(*call, "--steps", 4, "--out", "way")
+    assert (status, out) == (0, "Wrote 4 rooms, strip.png and animation.gif to way\n"), errors
+    files = {f"step_{k:02d}.{kind}" for k in range(4) for kind in ("json", "glb", "png")}
+    files |= {"overview.png", "strip.png", "animation.gif", "latents.npz"}
+    assert names_in(tmp_path / "way") == files
+    extra = json.loads((tmp_path / "way" / "step_03.json").read_text())["extra"]
+    assert extra["along"] == 1 and extra["to"] == end and extra["slots"]
+
+
+def test_retrieve(command, rooms, tmp_path):
+    models = {"bed": "King-size Bed", "ward": "Wardrobe", "gone": "Desk"}
+    made = {key: (label, corner_sofa()) for key, label in models.items()}
+    write_models(tmp_path / "models", made)
+    (tmp_path / "models" / "gone" / "raw_model.obj").unlink()
+    call = ["retrieve", "--scenes", "rooms", "--models", "models", "--cache", "cache"]
+    status, out, errors = command(*call, "--out", "cad")
+    assert status == 0, errors
+    assert "1 models are broken; see retrieval.json\nWrote 3 rooms to cad\n" in out
+    report = json.loads((tmp_path / "cad" / "retrieval.json").read_text())
+    assert report["scenes"] == 3 and set(report["broken_models"]) == {"gone"}
+    scene = json.loads((tmp_path / "cad" / "seed0_0000.json").read_text())
+    for item, found in zip(scene["objects"], scene["extra"]["retrieval"], strict=True):
+        known = {"double_bed": "bed", "wardrobe": "ward"}
+        assert (found or {}).get("model_id") == known.get(item["class"])
+    assert command(*call, "--out", "again")[0] == 0
+    assert everything_in(tmp_path / "cad") == everything_in(tmp_path / "again")
+
+
 def test_complete_adds_what_is_asked_for(command, sampler_run, tmp_path, few_attempts):
     empty = {
         "format": "sceneprior-scene", "version": 1, "name": "mine", "objects": [],
-        "label_set": "front3d_bedroom", "floor_m": [[-2, -2], [2, -2], [2, 2], [-2, 2]],
+        "label_set": BEDROOM, "floor_m": [[-2, -2], [2, -2], [2, 2], [-2, 2]],
     }  # fmt: skip
     (tmp_path / "given.json").write_text(json.dumps(empty))
     call = ["complete", "--given", "given.json", "-n", 2, "--classes", "double_bed, nightstand"]
@@ -149,22 +150,71 @@ def test_complete_adds_what_is_asked_for(command, sampler_run, tmp_path, few_att
     assert len(room["objects"]) == 1 and room["extra"]["no_place"] == ["double_bed"]
 
 
-def test_a_place_that_cannot_be_written_is_a_sentence(
-    command, toy_run, toy_shards, rooms, tmp_path, monkeypatch
+# -- Packed priors, which stand wherever a run may stand, and exports ------------------------------
+
+
+@pytest.fixture
+def packed(command, sampler_run, tmp_path):
+    """A packed prior at `mine.prior`."""
+    (tmp_path / "about.md").write_text("Toys, made by hand; CC0.\n")
+    status, out, errors = command("pack", sampler_run, "--out", "mine.prior", "--about", "about.md")
+    assert (status, errors) == (0, "") and out.startswith("Wrote mine.prior (0.")
+    return tmp_path / "mine.prior"
+
+
+def test_scores_of_a_packed_prior_need_a_file_and_shards(
+    command, packed, toy_shards, tmp_path, monkeypatch, few_attempts
 ):
-    write_models(tmp_path / "models", {"bed": ("King-size Bed", corner_sofa())})
+    without_classifiers(monkeypatch)
+    into = ["--out", "s.json"]
+    call = ["eval-fid", "--run", "procthor-bedroom", "-n", 3, *into]
+    refuses(command, "cli/eval_fid_without_the_shards_of_a_run", *call)
+    call = ["eval-fid", "--run", "mine.prior", "-n", 3, "--resamples", 0, *into]
+    status, _, errors = command(*call, "--shards", toy_shards)
+    assert status == 0, errors
+    assert json.loads((tmp_path / "s.json").read_text())["protocol"]["run"] == "mine.prior"
+    call = ["eval-svr", "--run", "mine.prior", "--shards", toy_shards, *into]
+    refuses(command, "cli/eval_svr_without_latents", *call)
 
-    def refuse(*_):
-        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
-    monkeypatch.setattr(files.os, "fsync", refuse)
-    for words in (
-        ("export", "rooms", "--to", "obj"),
-        ("complete", "--run", toy_run, "--given", rooms / "seed0_0000.json"),
-        ("interpolate", "--run", toy_run, "--from", "seed:1", "--to", "seed:2"),
-        ("retrieve", "--scenes", "rooms", "--models", "models", "--cache", "cache"),
-        ("reconstruct", "--run", toy_run, "--shards", toy_shards, "--split", "test"),
-    ):
-        said = one_sentence(command(*words, "--out", "new"))
-        assert "new cannot be read or written (Read-only file system); name a folder that" in said
-        assert not (tmp_path / "new").exists()
+def test_pack_says_what_is_missing(command, packed, sampler_run, toy_run, tmp_path):
+    call = ["pack", sampler_run, "--out", "mine.prior"]
+    refuses(command, "cli/pack_over_a_file", *call)
+    status, _, errors = command(*call, "--overwrite")
+    assert status == 0 and "does not state the data's authors and licence" in errors
+    call = ["pack", sampler_run, "--out", "b.prior", "--about"]
+    os.mkfifo("pipe")
+    for about in ("absent.md", "pipe"):
+        refuses(command, "cli/pack_about_no_file", *call, about, about=about)
+    Path("long.md").write_text("x" * 2**21)
+    assert "README.md of b.prior would have" in one_sentence(command(*call, "long.md"))
+    refuses(command, "cli/pack_a_packed_prior", "pack", "mine.prior", "--out", "b.prior")
+    assert not Path("b.prior").exists()
+    _, _, errors = command("pack", toy_run, "--out", "c.prior")
+    assert "needs --latents" not in errors  # its rooms are drawn by `paper`
+    run = shutil.copytree(toy_run, tmp_path / "run")
+    config = run / "config.yaml"
+    config.write_text(config.read_text().replace("distribution: paper", "distribution: kernel"))
+    _, _, errors = command("pack", run, "--out", "d.prior")
+    assert "draws rooms from 'kernel', which needs --latents" in errors
+    _, _, errors = command("pack", run, "--out", "e.prior", "--latents")
+    assert "needs --latents" not in errors
+
+
+def test_priors_are_listed_and_their_cards_printed(command, packed):
+    status, out, _ = command("priors")
+    assert status == 0
+    assert [line.split()[0] for line in out.splitlines()] == list(shipped_priors())
+    status, out, _ = command("priors", "mine.prior")
+    assert status == 0 and "# mine\n" in out and "Toys, made by hand; CC0." in out
+
+
+def test_export_goes_both_ways(command, tmp_path):
+    bed = SceneObject("double_bed", (0.2, 0.3, -0.9), (1.7, 0.6, 2.1))
+    write_scenes([Scene(name, BEDROOM, (bed,)) for name in ("first", "second")], tmp_path / "rooms")
+    for to in FORMATS:
+        status, out, errors = command("export", "rooms", "--to", to, "--out", to)
+        assert (status, out) == (0, f"Wrote 2 rooms to {to}\n"), errors
+    back = ["export", "atiss", "--to", "scenes", "--out", "back", "--label-set", BEDROOM]
+    assert command(*back)[0] == 0
+    assert {path.stem for path in (tmp_path / "back").glob("*.json")} == {"first", "second"}
