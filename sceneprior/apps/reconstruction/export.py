@@ -88,7 +88,7 @@ def picture(found: Reconstruction) -> UInt8[np.ndarray, "height width 3"]:
     return np.concatenate([sheet, _legend([names[row] for row in rows], colors[rows], sheet)])
 
 
-def _scaled(panel: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
+def _scaled(panel: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "tall wide 3"]:
     width = max(round(panel.shape[1] * HEIGHT_PX / panel.shape[0]), 1)
     scaled = Image.fromarray(panel).resize((width, HEIGHT_PX), Image.Resampling.NEAREST)
     return np.asarray(scaled)

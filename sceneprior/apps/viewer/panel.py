@@ -110,9 +110,9 @@ class Panel:
         with gui.add_folder("New room"):
             known = explorer.distributions
             if explorer.takes_requests:
-                self.request = RequestFields(gui, asked)
+                self.request = request = RequestFields(gui, asked)
                 clear = gui.add_button("Clear the request", color="gray")
-                clear.on_click(lambda _: page.safely(self.request.clear))
+                clear.on_click(lambda _: page.safely(request.clear))
             origin = gui.add_dropdown("From", known, initial_value=known[0]) if known else None
             seed: Any = gui.add_number("Seed", 0, min=0, step=1)
 
@@ -127,7 +127,7 @@ class Panel:
                     each.on_update(lambda _: page.safely(sample))
             gui.add_button("Make room").on_click(lambda _: page.safely(sample))
             gui.add_button("Next seed").on_click(lambda _: page.safely(another))
-            if (request := self.request) is not None:
+            if explorer.takes_requests:
                 again: Any = gui.add_number("Seed ", 0, min=0, step=1)
                 complete = gui.add_button(
                     "Complete the rest",
