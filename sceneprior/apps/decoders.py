@@ -4,8 +4,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from sceneprior.baselines.atiss2d import Atiss2dConfig
-from sceneprior.baselines.lstm import LstmConfig
+from sceneprior.baselines.decoders import Atiss2dConfig, LstmConfig
 from sceneprior.lifted.config import LiftedConfig, LiftedModel
 from sceneprior.paper.config import PaperConfig, PaperModel
 from sceneprior.paper.transformer import TransformerConfig

@@ -6,7 +6,7 @@ from references.scene_decoder import attend, normalise
 from torch.nn import functional as F
 from torch.testing import assert_close
 
-from sceneprior.baselines.atiss2d import Atiss2dConfig, SceneAtiss
+from sceneprior.baselines.decoders import Atiss2dConfig, SceneAtiss
 
 # Sums in another order, through four layers: a few roundings of numbers around 1.
 TOLERANCE = {torch.float32: 2e-5, torch.float64: 1e-12}

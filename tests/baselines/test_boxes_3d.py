@@ -7,8 +7,7 @@ from toy_rooms import write_toy_shards
 
 from sceneprior.apps.config import load_any_run, load_run
 from sceneprior.apps.sample import sample_rooms
-from sceneprior.baselines.atiss.network import END
-from sceneprior.baselines.atiss.stage import part_of_rooms
+from sceneprior.baselines.atiss import END, part_of_rooms
 from sceneprior.baselines.true_boxes import TruthDataset
 from sceneprior.core.errors import ConfigError, InputError
 from sceneprior.core.views import RoomBoxes

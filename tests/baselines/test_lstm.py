@@ -4,7 +4,7 @@ import torch
 from torch.nn import functional as F
 from torch.testing import assert_close
 
-from sceneprior.baselines.lstm import SceneLstm
+from sceneprior.baselines.decoders import SceneLstm
 
 
 def made(width=6) -> SceneLstm:

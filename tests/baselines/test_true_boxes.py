@@ -158,6 +158,6 @@ def test_only_baselines_with_3d_supervision_read_the_ground_truth():
     assert readers == {f"{views}/truth.py", "lifted/reconstruction/known_rooms.py"}
     assert importers["TruthDataset"] == set()
     assert importers["BoxConfig"] == {
-        f"baselines/{name}/stage.py" for name in ("atiss", "sync2gen", "set_flow")
+        f"baselines/{name}.py" for name in ("atiss", "sync2gen", "set_flow")
     }
     assert importers["TrueViewDataset"] == {f"{views}/total3d.py"}

@@ -14,8 +14,8 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
-from sceneprior.baselines.gan.discriminator import MapDiscriminator
 from sceneprior.baselines.gan.losses import (
+    MapDiscriminator,
     adversarial_loss,
     bounds_penalty,
     contents,

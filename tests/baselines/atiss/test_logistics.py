@@ -6,7 +6,7 @@ import torch
 from scipy import stats
 from torch.testing import assert_close
 
-from sceneprior.baselines.atiss.logistics import HALF_STEP, LEVELS, LogisticMixture
+from sceneprior.baselines.atiss import HALF_STEP, LEVELS, LogisticMixture
 
 
 @pytest.fixture

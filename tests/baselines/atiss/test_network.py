@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from sceneprior.baselines.atiss.network import (
+from sceneprior.baselines.atiss import (
     END,
     OCTAVES,
     PARTS,

@@ -8,8 +8,7 @@ import torch
 from tiny_runs import tiny_baseline
 from torch.testing import assert_close
 
-from sceneprior.baselines.set_flow.network import NUMBERS, SetFlow, SetFlowModel
-from sceneprior.baselines.set_flow.stage import matched
+from sceneprior.baselines.set_flow import NUMBERS, SetFlow, SetFlowModel, matched
 from sceneprior.baselines.true_boxes import TruthDataset
 from sceneprior.core.views import RoomBoxes
 from sceneprior.training.steps import with_cosine

@@ -5,7 +5,7 @@ import torch
 from torch.nn import functional as F
 from torch.testing import assert_close
 
-from sceneprior.baselines.sync2gen.network import READS, SparseLinear, Sync2Gen, Sync2genModel
+from sceneprior.baselines.sync2gen import READS, SparseLinear, Sync2Gen, Sync2genModel
 from sceneprior.core.views import RoomBoxes
 
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from sceneprior.baselines.sync2gen import pairs as arrangement
-from sceneprior.baselines.sync2gen.pairs import (
+from sceneprior.baselines import sync2gen as arrangement
+from sceneprior.baselines.sync2gen import (
     ANYWHERE,
     AREA_M2,
     BANDWIDTH_M,

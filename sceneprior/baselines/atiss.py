@@ -1,21 +1,78 @@
-"""The network of ATISS: the distribution of the next box, given the boxes placed so far.
+"""ATISS with 3D supervision: the distribution of the next box, given the boxes placed so far.
 
 Source: Paschalidou et al., "ATISS: Autoregressive Transformers for Indoor Scene Synthesis", NeurIPS
-2021; docs/baselines_3d.md names the differences.
-"""
+2021; docs/baselines_3d.md names the differences."""
 
 import math
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
 from pydantic import Field, model_validator
 from torch import Tensor, nn
+from torch.nn import functional as F
 
-from sceneprior.baselines.atiss.logistics import LogisticMixture
+from sceneprior.baselines.one_stage import OneStage, OneStageTraining
+from sceneprior.baselines.true_boxes import BoxConfig, room_means
 from sceneprior.core.mixtures import draw_index
 from sceneprior.core.settings import Section
 from sceneprior.core.views import RoomBoxes
 from sceneprior.paper.layers import mlp
+from sceneprior.training.steps import batch_seed, full_precision
+
+LEVELS = 256
+"""Number of steps into which [-1, 1] is divided. The probability of a step is at most 1, whereas a
+continuous density could grow without bound where many rooms share a value."""
+HALF_STEP = 1 / (LEVELS - 1)
+LEAST_LOG_SCALE = -7.0
+"""Minimum log-scale; at this scale, a logistic already lies within one step."""
+
+
+@dataclass(frozen=True)
+class LogisticMixture:
+    """A mixture of K weighted logistics for each number."""
+
+    weight_logits: Float[Tensor, "*batch mixtures"]
+    means: Float[Tensor, "*batch mixtures"]
+    log_scales: Float[Tensor, "*batch mixtures"]
+
+    @classmethod
+    def of(cls, features: Float[Tensor, "*batch triples"]) -> "LogisticMixture":
+        """Build the mixture from a network's output, 3 K features per number."""
+        weight_logits, means, log_scales = features.chunk(3, dim=-1)
+        return cls(weight_logits, means, log_scales.clamp(min=LEAST_LOG_SCALE))
+
+    def log_prob(self, values: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """Log-probability of the step around each value. The outermost steps extend to infinity, so
+        that all steps together have probability 1.
+
+        The probability of a step with scaled ends a > b is
+
+            sigmoid(a) - sigmoid(b) = sigmoid(a) * sigmoid(-b) * (1 - exp(b - a)),
+
+        and the logarithm of the right side is accurate for all a and b.
+        """
+        offset = values.unsqueeze(-1) - self.means
+        inverse = torch.exp(-self.log_scales)
+        below_upper = F.logsigmoid((offset + HALF_STEP) * inverse)
+        above_lower = F.logsigmoid((HALF_STEP - offset) * inverse)
+        inside = below_upper + above_lower + torch.log(-torch.expm1(-2 * HALF_STEP * inverse))
+        value = values.unsqueeze(-1)
+        first, last = value < HALF_STEP - 1, value > 1 - HALF_STEP
+        of_each = torch.where(first, below_upper, torch.where(last, above_lower, inside))
+        return torch.logsumexp(self.weight_logits.log_softmax(dim=-1) + of_each, dim=-1)
+
+    def draw(
+        self, choice: Float[Tensor, "*batch"], place: Float[Tensor, "*batch"]
+    ) -> Float[Tensor, "*batch"]:
+        """Samples in [-1, 1] from uniform numbers: `choice` selects the logistic, and `place` the
+        quantile within it."""
+        chosen = draw_index(self.weight_logits, choice).unsqueeze(-1)
+        mean = self.means.gather(-1, chosen)[..., 0]
+        scale = self.log_scales.gather(-1, chosen)[..., 0].exp()
+        return (mean + scale * torch.logit(place, eps=1e-6)).clamp(-1, 1)
+
 
 END = 0
 """Class that ends a room: void, which no piece of furniture has."""
@@ -207,3 +264,64 @@ def fourier_features(unit: Float[Tensor, "*batch numbers"]) -> Float[Tensor, "*b
 
 def _head(inputs: int, outputs: int) -> nn.Sequential:
     return mlp(nn.Linear(inputs, inputs), nn.Linear(inputs, outputs))
+
+
+class AtissTraining(OneStageTraining):
+    """The published settings. Do not clip gradients (docs/baselines_3d.md)."""
+
+    epochs: int = Field(500, ge=1)
+    """500 epochs are the published 100,000 steps for 6,300 rooms with turned copies."""
+    batch_size: int = Field(128, ge=1)
+    learning_rate: float = Field(1e-4, gt=0)
+
+
+class AtissConfig(BoxConfig):
+    """Config of a run of ATISS."""
+
+    method: Literal["atiss"] = "atiss"
+    model: AtissModel
+    training: AtissTraining = AtissTraining()
+
+    def make(self) -> "AtissStage":
+        return AtissStage(Atiss(self.model, self.classes), self.training, self.seed)
+
+
+class AtissStage(OneStage):
+    """Maximises the likelihood of one object of each room, given some of the others."""
+
+    prior: Atiss
+
+    def __init__(self, prior: Atiss, settings: AtissTraining, seed: int):
+        super().__init__(prior, settings)
+        self.seed = seed
+
+    def training_step(self, rooms: RoomBoxes, batch_idx: int) -> Tensor:
+        placed, coming = part_of_rooms(rooms, batch_seed(self.seed, self.trainer, batch_idx))
+        unit, next_unit = self.prior.to_unit(placed), self.prior.to_unit(coming)
+        context = self.prior.context(placed.object_class, unit, placed.is_object)
+        with full_precision(self.device):
+            next_class = coming.object_class[:, 0]
+            log_probs = self.prior.log_prob(context.float(), next_class, next_unit[:, 0])
+            losses = {name: -log_prob for name, log_prob in log_probs.items()}
+            return self.total(room_means(losses, rooms), {}, rooms)
+
+
+def part_of_rooms(rooms: RoomBoxes, seed: int) -> tuple[RoomBoxes, RoomBoxes]:
+    """Shuffle each room's n objects and keep the first k, with k drawn uniformly from 0 to n.
+
+    Also returns the next object of each room, whose class is `END` if all objects are kept.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    count = rooms.is_object.sum(dim=1)
+    device = rooms.boxes_m.device
+    tickets = torch.rand(rooms.is_object.shape, generator=generator).to(device)
+    order = tickets.masked_fill(~rooms.is_object, 2.0).argsort(dim=1)
+    kept = (torch.rand(len(count), generator=generator).to(device) * (count + 1)).long()
+    shuffled = rooms.take(order)
+    placed = torch.arange(order.shape[1], device=device) < kept[:, None]
+    coming = shuffled.take(kept[:, None].clamp(max=order.shape[1] - 1))
+    more = (kept < count)[:, None]
+    return (
+        replace(shuffled, object_class=shuffled.object_class * placed, is_object=placed),
+        replace(coming, object_class=coming.object_class.where(more, END), is_object=more),
+    )

@@ -1,1 +1,0 @@
-"""ATISS with 3D supervision."""

@@ -1,1 +1,0 @@
-"""A flow model of sets of objects, with 3D supervision."""

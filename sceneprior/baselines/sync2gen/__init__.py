@@ -1,1 +1,0 @@
-"""A Sync2Gen-style VAE with 3D supervision."""
