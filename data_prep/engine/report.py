@@ -11,7 +11,7 @@ from typing import Any
 from rich.table import Column, Table
 from rich.text import Text
 
-from data_prep.engine.source import SPLITS, Expected, Line, PreparedRoom, RoomTask, Source
+from data_prep.engine.source import SPLITS, Line, PreparedRoom, RoomTask, Source
 from sceneprior.core.classes import label_set
 from sceneprior.core.shards import INDEX_NAME
 
@@ -60,9 +60,7 @@ def count_splits(lines: Iterable[Line]) -> dict[str, dict[str, int]]:
     }
 
 
-def make_report(
-    lines: Sequence[Line], about: dict[str, Any], expected: Expected | None = None
-) -> dict[str, Any]:
+def make_report(lines: Sequence[Line], about: dict[str, Any]) -> dict[str, Any]:
     """Build the report of a job, with the entries `about` at its top.
 
     It does not depend on time, workers or interruptions.
@@ -72,7 +70,7 @@ def make_report(
     for line in lines:
         if line.status == "filtered":
             filtered.setdefault(line.rule, []).append(line.room_id)
-    report = {
+    return {
         "format": "sceneprior-report",
         "version": 1,
         **about,
@@ -94,23 +92,8 @@ def make_report(
         },
         "classes": _sums(line.classes for line in prepared),
         "unknown_categories": _sums(line.unknown_categories for line in lines),
+        "rooms": [asdict(line) for line in lines],
     }
-    if expected is not None:
-        report["expected"] = {"of": expected.of, "rows": compare(expected, prepared)}
-    return report | {"rooms": [asdict(line) for line in lines]}
-
-
-def compare(expected: Expected, prepared: Sequence[Line]) -> list[dict[str, Any]]:
-    """Compare each count stated in the recipe: one row of name, expected, found, difference."""
-    counts = count_splits(prepared)
-    found = {split: count["rooms"] for split, count in counts.items()}
-    for what in ("rooms", "views", "objects"):
-        found[what] = sum(count[what] for count in counts.values())
-    return [
-        {"what": what, "expected": count, "found": found[what], "difference": found[what] - count}
-        for what, count in expected.model_dump().items()
-        if what != "of" and count is not None
-    ]
 
 
 def _kinds_of_notes(lines: Sequence[Line]) -> dict[str, int]:
@@ -188,9 +171,7 @@ class Summary:
             "renderer": self.renderer,
             "summary": str(self),
         }
-        # Expected counts are known only for the whole data set.
-        expected = self.source.expected if self.source.only is None else None
-        return make_report(self.lines, about, expected)
+        return make_report(self.lines, about)
 
     def __str__(self) -> str:
         parts = [
@@ -218,7 +199,7 @@ def make_table(
 
 
 def report_tables(report: dict[str, Any]) -> list[Table]:
-    """Format the report of `make_report` as tables, from outcomes to expected counts."""
+    """Format the report of `make_report` as tables."""
     means, statuses = report["per_split"], report["statuses"]
     outcomes = [
         ("found", report["found"]),
@@ -255,14 +236,6 @@ def report_tables(report: dict[str, Any]) -> list[Table]:
         more = [(f"and {len(failed) - _FAILURES_SHOWN} more", "report.csv lists all of them")]
         rows = failed[:_FAILURES_SHOWN] + more * (len(failed) > _FAILURES_SHOWN)
         tables.append(make_table((Column("failed", overflow="fold"), "why"), rows))
-    if "expected" in report:
-        rows = [
-            (row["what"], row["expected"], row["found"],
-             f"{row['difference']:+d}" if row["difference"] else "as expected")
-            for row in report["expected"]["rows"]
-        ]  # fmt: skip
-        columns = ("count", "expected", "found", "difference")
-        tables.append(make_table(columns, rows, report["expected"]["of"] or None))
     return tables
 
 

@@ -12,26 +12,12 @@ from typing import Any, Protocol
 from data_prep.engine.workers import Run
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Mesh
-from sceneprior.core.settings import Section
 from sceneprior.core.shards import RoomGroundTruth, RoomViews
 from sceneprior.render.offscreen import Renderer
 
 SPLITS = ("train", "val", "test")
 """Rooms for training, for choosing settings and checkpoints, and for reporting results."""
 _DEBUG_VARIABLE = "SCENEPRIOR_DEBUG"
-
-
-class Expected(Section):
-    """Expected counts of a finished job on the real data set."""
-
-    of: str = ""
-    """Origin of the counts, data and author: "3D-FRONT, ATISS's index"."""
-    rooms: int | None = None
-    train: int | None = None
-    val: int | None = None
-    test: int | None = None
-    views: int | None = None
-    objects: int | None = None
 
 
 @dataclass(frozen=True)
@@ -120,7 +106,6 @@ class Source(Protocol):
         room_type: Type of the rooms; also in the shards' names: `train/<room_type>_0000.h5`.
         draws: True if `prepare` needs a renderer; otherwise it gets None.
         only: Requested part: HOUSE, HOUSE/ROOM or a room id (selection.py); None for everything.
-        expected: Counts that the recipe expects, for the report.
     """
 
     @property
@@ -133,8 +118,6 @@ class Source(Protocol):
     def draws(self) -> bool: ...
     @property
     def only(self) -> str | None: ...
-    @property
-    def expected(self) -> Expected | None: ...
 
     def settings(self, only: str | None) -> dict[str, Any]:
         """Settings that the shards' bytes depend on, as JSON, without paths.

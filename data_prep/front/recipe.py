@@ -5,7 +5,6 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field
 
-from data_prep.engine.source import Expected
 from sceneprior.core.classes import LABEL_SETS, label_set, label_set_name
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import is_name
@@ -106,8 +105,6 @@ class Recipe(Section):
     allow_mirrored: bool = True
     """False leaves out rooms with furniture of negative scale."""
     views: ViewRules = Field(default_factory=ViewRules)
-    expected: Expected | None = None
-    """Counts that the report compares with; no effect on the shards."""
 
     def of_type(self, room_type: str) -> bool:
         """Test whether the recipe accepts this type of room."""

@@ -17,7 +17,6 @@ from data_prep.engine.plan import (
 )
 from data_prep.engine.source import (
     SPLITS,
-    Expected,
     Line,
     PreparedRoom,
     RoomTask,
@@ -63,10 +62,6 @@ class FrontSource:
     def room_type(self) -> str:
         return self.recipe.name
 
-    @property
-    def expected(self) -> Expected | None:
-        return self.recipe.expected
-
     def settings(self, only: str | None) -> dict[str, Any]:
         """See `Source.settings`."""
         info = model_info_path(Path(self.future))
@@ -75,7 +70,7 @@ class FrontSource:
             read_splits(self.splits)
         return {
             "recipe": {
-                **self.recipe.model_dump(exclude={"expected"}),
+                **self.recipe.model_dump(),
                 # The ids are hashed, because there may be thousands.
                 "invalid_rooms": _digest_of_ids(self.recipe.invalid_rooms),
                 "invalid_models": _digest_of_ids(self.recipe.invalid_models),

@@ -15,7 +15,6 @@ from data_prep.engine.plan import (
 )
 from data_prep.engine.source import (
     SPLITS,
-    Expected,
     Line,
     PreparedRoom,
     RoomTask,
@@ -64,7 +63,6 @@ class PublicSource:
     """The `Source` (data_prep/engine/source.py) behind `prep-dataset`."""
 
     draws: ClassVar = False
-    expected: ClassVar[Expected | None] = None
     reader: Reader
     splits: Path | None = None
     """CSV with two columns: a room or scene, and its split. None takes the data set's official

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from toy_rooms import LABEL_SET, make_toy_room
 
-from data_prep.engine.source import Expected, Line, PreparedRoom, RoomTask, Survey
+from data_prep.engine.source import Line, PreparedRoom, RoomTask, Survey
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Mesh
 
@@ -24,7 +24,6 @@ class ToySource:
     room_type: str = "toys"
     draws: bool = False
     only: str | None = None
-    expected: Expected | None = None
 
     def settings(self, only: str | None) -> dict[str, Any]:
         return {"rooms": self.rooms}

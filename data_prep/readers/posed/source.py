@@ -12,7 +12,7 @@ from data_prep.engine.plan import (
     seeded_split,
     select,
 )
-from data_prep.engine.source import Expected, Line, PreparedRoom, RoomTask, Survey, sentence_of
+from data_prep.engine.source import Line, PreparedRoom, RoomTask, Survey, sentence_of
 from data_prep.engine.workers import Run
 from data_prep.readers.posed.cameras import seems_up
 from data_prep.readers.posed.formats import Formats, mask_files
@@ -33,7 +33,6 @@ class PosedSource:
     name: ClassVar = "posed"
     room_type: ClassVar = "posed"
     draws: ClassVar = False
-    expected: ClassVar[Expected | None] = None
     folder: Path
     """One room, or a folder of rooms."""
     label_set: str

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from data_prep.engine.plan import digest, house_may_match, seeded_split, select
-from data_prep.engine.source import Expected, Line, PreparedRoom, RoomTask, Survey
+from data_prep.engine.source import Line, PreparedRoom, RoomTask, Survey
 from data_prep.engine.workers import Run
 from data_prep.readers.heading import find_turn, note_of_turn
 from data_prep.readers.scannet.labels import LABEL_SET, Labels, read_labels
@@ -15,11 +15,6 @@ from data_prep.readers.scannet.splits import find_scans, space_of, split_scans
 from data_prep.readers.scannet.views import prepare_scan
 from sceneprior.core.errors import InputError
 from sceneprior.render.offscreen import Renderer
-
-_OFFICIAL = Expected(
-    of="ScanNet v2 by its lists; views as the paper counts them (section 5)",
-    rooms=1513, train=1201, test=312, views=108_059,
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -36,14 +31,10 @@ class ScanNetSource:
     scan_settings: ScanSettings = field(default_factory=ScanSettings)
     train: Path | None = None
     val: Path | None = None
-    """The official lists; `val` becomes the split `test`. None splits the spaces 9:1 by the
+    """The official lists of 1,201 and 312 scans; `val` becomes the split `test`. None splits the spaces 9:1 by the
     seed."""
     seed: int = 0
     only: str | None = None
-
-    @property
-    def expected(self) -> Expected | None:
-        return _OFFICIAL if self.train and self.val and self.only is None else None
 
     def settings(self, only: str | None) -> dict[str, Any]:
         """See `Source.settings`."""

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from data_prep.engine.build import build_shards
 from data_prep.engine.report import make_report, report_tables
-from data_prep.engine.source import Expected, Line
+from data_prep.engine.source import Line
 
 
 def test_every_room_left_out_is_named_with_the_reason(front, tmp_path):
@@ -54,8 +54,7 @@ def test_the_figures_are_those_of_the_rooms():
         Line("e", "g", "failed", reason="it has no floor"),
         Line("f", "g", "filtered", rule="max_objects", reason="15 objects"),
     ]  # fmt: skip
-    expected = Expected(of="a paper", rooms=3, test=2, views=12)
-    report = make_report(lines, {"source": "toy"}, expected)
+    report = make_report(lines, {"source": "toy"})
     assert report["counts"]["train"] == {"rooms": 2, "views": 6, "objects": 5}
     assert report["per_split"]["train"]["objects_per_view"] == 1.5
     console = Console(width=120, record=True)

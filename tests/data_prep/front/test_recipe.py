@@ -22,7 +22,7 @@ scale_range: [1e-3, 5]
 def test_what_ships_is_as_before_and_prints_itself(name, tmp_path):
     shipped = load_recipe(name)
     classes = {category: shipped.class_of(category) for category in category_table()}
-    hold("recipes", {name: {**shipped.model_dump(exclude={"expected"}), "classes": classes}})
+    hold("recipes", {name: {**shipped.model_dump(), "classes": classes}})
     assert set(classes.values()) == set(label_set(shipped.label_set))
     # Every category that ATISS lists has a class, so counting all pieces or classes is one.
     assert all(classes[category] != "void" for category in shipped.allowed_categories)
