@@ -11,35 +11,32 @@ import typer
 from sceneprior.core.repeatable import LARGEST_SEED
 
 if TYPE_CHECKING:
-    from data_prep.engine.build import Job
+    from data_prep.engine.source import Source
 
 
 def add_commands(app: typer.Typer) -> None:
     """Mount the prep-* commands, inspect and make-homes."""
     for command in (
-        make_homes,
-        prep_front,
-        recipe,
-        prep_scannet,
-        prep_posed,
-        prep_dataset,
-        inspect,
-    ):
+        make_homes, prep_front, recipe, prep_scannet, prep_posed, prep_dataset, inspect
+    ):  # fmt: skip
         app.command()(command)
 
 
 _SHEET = "inspect.png"
 _PROBLEMS_SHOWN = 10
 
-OutOption = Annotated[Path, typer.Option(help="Folder for the shards.")]
-WorkersOption = Annotated[
+Out = Annotated[Path, typer.Option(help="Folder for the shards.")]
+Workers = Annotated[
     int | None, typer.Option(min=1, help="Processes on this machine (default: all cores).")
 ]
-SeedOption = Annotated[
+Seed = Annotated[
     int, typer.Option(min=0, max=LARGEST_SEED, help="The same seed writes the same bytes.")
 ]
-RetryOption = Annotated[
+Retry = Annotated[
     bool, typer.Option("--retry-failed", help="Try rooms again that failed in an earlier run.")
+]
+MaxViews = Annotated[
+    int, typer.Option(help="Largest number of views per room; others are thinned out.")
 ]
 
 
@@ -49,7 +46,7 @@ def make_homes(
         int, typer.Option(help="Number of rooms: 70% train, 10% val, 20% test.")
     ] = 400,
     room_type: Annotated[str, typer.Option(help="bedroom or living.")] = "bedroom",
-    seed: SeedOption = 0,
+    seed: Seed = 0,
 ) -> None:
     """Make furnished homes in 3D-FRONT's on-disk format."""
     from data_prep.homes import make
@@ -61,7 +58,7 @@ def make_homes(
 def prep_front(
     front: Annotated[Path, typer.Option(help="Folder of house JSONs (3D-FRONT).")],
     future: Annotated[Path, typer.Option(help="Folder of furniture models (3D-FUTURE-model).")],
-    out: OutOption,
+    out: Out,
     recipe: Annotated[
         str,
         typer.Option(
@@ -81,21 +78,17 @@ def prep_front(
         list[str] | None,
         typer.Option(help="Change a rule of the recipe: max_floor_m=8; null turns it off."),
     ] = None,
-    seed: SeedOption = 0,
-    rgb: Annotated[
-        bool, typer.Option("--rgb", help="Also write shaded pictures, OUT/rgb/ROOM/VIEW.png.")
-    ] = False,
-    workers: WorkersOption = None,
+    seed: Seed = 0,
+    workers: Workers = None,
     only: Annotated[
         str | None, typer.Option(help="One house or room only: HOUSE, HOUSE/ROOM or a room id.")
     ] = None,
-    retry_failed: RetryOption = False,
+    retry_failed: Retry = False,
 ) -> None:
     """Turn houses in 3D-FRONT's format into view shards. The same command resumes a stopped run.
 
     Exit status: 0, or 3 if rooms failed (the others are prepared; report.csv says why).
     """
-    from data_prep.engine.build import Job
     from data_prep.front.recipe import load_recipe
     from data_prep.front.source import FrontSource
 
@@ -103,8 +96,8 @@ def prep_front(
     if views_per_m2 is not None:
         changes.append(f"views.per_m2={views_per_m2}")
     rules = load_recipe(recipe, tuple(changes))
-    source = FrontSource(front, future, rules, splits, seed, only, rgb)
-    run_job(Job(source, out, workers, retry_failed))
+    source = FrontSource(front, future, rules, splits, seed, only)
+    run_job(source, out, workers, retry_failed)
 
 
 def recipe(
@@ -119,7 +112,7 @@ def recipe(
 def prep_scannet(
     scans: Annotated[Path, typer.Option(help="ScanNet's folder of scans.")],
     labels: Annotated[Path, typer.Option(help="scannetv2-labels.combined.tsv.")],
-    out: OutOption,
+    out: Out,
     masks: Annotated[
         str, typer.Option(help="ScanNet's masks: filt (cleaned) or raw (the mesh, projected).")
     ] = "filt",
@@ -127,9 +120,7 @@ def prep_scannet(
         bool, typer.Option("--full-size", help="Images of 1296 x 968 pixels, not 324 x 242.")
     ] = False,
     frame_step: Annotated[int, typer.Option(help="Every n-th frame is a candidate.")] = 15,
-    max_views: Annotated[
-        int, typer.Option(help="Largest number of views per scan; others are thinned out.")
-    ] = 100,
+    max_views: MaxViews = 100,
     train_list: Annotated[
         Path | None, typer.Option(help="List of training scans, scannetv2_train.txt.")
     ] = None,
@@ -137,23 +128,22 @@ def prep_scannet(
         Path | None,
         typer.Option(help="List of test scans, scannetv2_val.txt (default: a random 9:1 split)."),
     ] = None,
-    seed: SeedOption = 0,
-    workers: WorkersOption = None,
+    seed: Seed = 0,
+    workers: Workers = None,
     only: Annotated[str | None, typer.Option(help="A scan, or a prefix of scans' names.")] = None,
-    retry_failed: RetryOption = False,
+    retry_failed: Retry = False,
 ) -> None:
     """Turn ScanNet's recordings into view shards, directly from .sens files and zips.
 
     Exit status: 0, or 3 if scans failed (the others are prepared; report.csv says why).
     """
-    from data_prep.engine.build import Job
     from data_prep.readers.scannet.scans import FULL_SIZE, QUARTER_SIZE, ScanSettings
     from data_prep.readers.scannet.source import ScanNetSource
 
     size = FULL_SIZE if full_size else QUARTER_SIZE
     settings = ScanSettings(frame_step, max_views, masks, size)
     source = ScanNetSource(scans, labels, settings, train_list, val_list, seed, only)
-    run_job(Job(source, out, workers, "auto", retry_failed))
+    run_job(source, out, workers, retry_failed)
 
 
 def prep_posed(
@@ -161,7 +151,7 @@ def prep_posed(
         Path,
         typer.Argument(help="A room's folder (its poses and masks), or a folder of such."),
     ],
-    out: OutOption,
+    out: Out,
     label_set: Annotated[
         str,
         typer.Option(
@@ -203,19 +193,16 @@ def prep_posed(
         int | None,
         typer.Option(help="Longest side of stored masks in pixels (default: as they are)."),
     ] = None,
-    max_views: Annotated[
-        int, typer.Option(help="Largest number of views per room; others are thinned out.")
-    ] = 100,
+    max_views: MaxViews = 100,
     test_share: Annotated[float, typer.Option(help="Share of rooms in the test split.")] = 0.1,
-    seed: SeedOption = 0,
-    workers: WorkersOption = None,
+    seed: Seed = 0,
+    workers: Workers = None,
     only: Annotated[str | None, typer.Option(help="A room, or a prefix of rooms' names.")] = None,
 ) -> None:
     """Turn posed pictures with instance masks into view shards (docs/posed_data.md).
 
     Exit status: 0, or 3 if rooms failed (the others are prepared; report.csv says why).
     """
-    from data_prep.engine.build import Job
     from data_prep.readers.posed.formats import read_formats
     from data_prep.readers.posed.labels import read_label_set
     from data_prep.readers.posed.source import PosedSource
@@ -231,13 +218,13 @@ def prep_posed(
         typer.echo(f"Found {sentence}", err=True)
     for sentence in source.assumptions():
         typer.echo(f"Note: {sentence}", err=True)
-    run_job(Job(source, out, workers, "auto"))
+    run_job(source, out, workers)
 
 
 def prep_dataset(
     name: Annotated[str, typer.Argument(help="blenderproc, hypersim, structured3d or scannetpp.")],
     folder: Annotated[Path, typer.Argument(help="Folder of its scenes (docs/public_data.md).")],
-    out: OutOption,
+    out: Out,
     recipe: Annotated[
         str | None,
         typer.Option(
@@ -253,26 +240,23 @@ def prep_dataset(
         ),
     ] = None,
     max_side: Annotated[int, typer.Option(help="Longest side of stored masks in pixels.")] = 480,
-    max_views: Annotated[
-        int, typer.Option(help="Largest number of views per room; others are thinned out.")
-    ] = 100,
-    seed: SeedOption = 0,
-    workers: WorkersOption = None,
+    max_views: MaxViews = 100,
+    seed: Seed = 0,
+    workers: Workers = None,
     only: Annotated[
         str | None, typer.Option(help="One scene or room only: SCENE, SCENE/ROOM or a room id.")
     ] = None,
-    retry_failed: RetryOption = False,
+    retry_failed: Retry = False,
 ) -> None:
     """Turn a public data set into view shards (docs/public_data.md).
 
     Exit status: 0, or 3 if rooms failed (the others are prepared; report.csv says why).
     """
-    from data_prep.engine.build import Job
     from data_prep.readers.source import PublicSource, open_reader
 
     reader = open_reader(name, folder, recipe)
     source = PublicSource(reader, splits, max_side, max_views, seed, only)
-    run_job(Job(source, out, workers, "auto", retry_failed))
+    run_job(source, out, workers, retry_failed)
 
 
 def inspect(
@@ -282,9 +266,6 @@ def inspect(
         Path | None, typer.Option(help=f"File for the pictures (default: SHARDS/{_SHEET}).")
     ] = None,
     pictures: Annotated[int, typer.Option(min=1, help="Number of views to draw.")] = 24,
-    boxes_3d: Annotated[
-        bool, typer.Option("--boxes-3d/--no-boxes-3d", help="Draw 3D boxes of the ground truth.")
-    ] = True,
     verify: Annotated[
         bool, typer.Option("--verify", help="Check everything instead of drawing.")
     ] = False,
@@ -309,7 +290,7 @@ def inspect(
             Console().print(table)
     if png is not None or not verify:
         target = png or shards / _SHEET
-        sheet = draw_sheet(shards, room, pictures, boxes_3d)
+        sheet = draw_sheet(shards, room, pictures)
         try:
             write_whole(target, png_bytes(sheet))
         except OSError as error:
@@ -339,27 +320,28 @@ def _verify(shards: Path, room: str | None, workers: int) -> None:
     typer.echo(f"{shards}: {summary(found)}")
 
 
-def run_job(job: "Job") -> None:
+def run_job(
+    source: "Source", out: Path, workers: int | None, retry_failed: bool = False
+) -> None:
     """Build shards and print the report, for every `prep-*` command."""
     from rich.console import Console
 
-    from data_prep.engine.build import build_shards
+    from data_prep.engine.build import Job, build_shards
     from data_prep.engine.report import report_tables
 
     try:
-        summary = build_shards(job)
+        summary = build_shards(Job(source, out, workers, retry_failed))
     except KeyboardInterrupt:
         typer.echo("Stopped; finished shards are kept. Run the same command to continue.", err=True)
         raise typer.Exit(130) from None
-    console = Console()
     for table in report_tables(summary.report):
-        console.print(table)
+        Console().print(table)
     made = f"{summary.shards_made} shards made, {summary.shards_kept} already there"
     if summary.shards_open:
         made += f", {summary.shards_open} still to make: run without --only"
     drawn = f"; {summary.renderer}" if summary.renderer else ""
-    typer.echo(f"{job.out}: {summary} ({made}{drawn})")
-    if job.source.only is None and not summary.counts["test"]["rooms"]:
+    typer.echo(f"{out}: {summary} ({made}{drawn})")
+    if source.only is None and not summary.counts["test"]["rooms"]:
         typer.echo(
             "Note: the 'test' split is empty. `fit` and `synthesize` do not need it, but eval-fid "
             "does: prepare more rooms, or assign some to `test` in a file of splits.",

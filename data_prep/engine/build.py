@@ -196,8 +196,6 @@ def _prepared(
             continue
         for model_id, mesh in result.models.items():
             _write_model(out / MODELS_FOLDER / f"{model_id}.ply", mesh)
-        for name, data in result.files.items():
-            write_whole(out / name, data)
         yield result.views, result.truth
 
 

@@ -83,8 +83,6 @@ class PreparedRoom:
     """3D ground truth; None if the source has none."""
     models: Mapping[str, Mesh] = field(default_factory=dict)
     """Meshes by id, each in its own frame, for `models/<id>.ply`."""
-    files: Mapping[str, bytes] = field(default_factory=dict)
-    """Contents of further files by path within the output folder (`rgb/<room>/0000.png`)."""
     notes: tuple[str, ...] = ()
     """Parts of the room that were left out, with reasons."""
     unknown_categories: Mapping[str, int] = field(default_factory=dict)

@@ -1,6 +1,5 @@
-"""Furniture models of 3D-FUTURE: categories, meshes in metres, colours."""
+"""Furniture models of 3D-FUTURE: categories, and meshes in metres."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -58,13 +57,6 @@ class ModelBank:
             return Mesh(mesh.vertices_m / np.float32(100), mesh.faces)
         return mesh
 
-    def color(self, model_id: str) -> tuple[int, int, int] | None:
-        """One RGB colour for the whole model: the texture's mean, or else the material's colour.
-
-        None if the release has neither or they are damaged; colours are only used in pictures.
-        """
-        return _mean_of_texture(self.folder / model_id) or _material(self.folder / model_id)
-
 
 def unit_of(mesh: Mesh, entry: dict[str, Any]) -> float:
     """Metres per unit of a loaded mesh: 0.01 if it is 50 to 200 times as long as stated, else 1.
@@ -90,30 +82,3 @@ def _longest(size: Any) -> float | None:
     except (TypeError, ValueError, OverflowError):
         return None
     return max(sides) if len(sides) == 3 and all(1e-3 < side < 1e3 for side in sides) else None
-
-
-def _mean_of_texture(folder: Path) -> tuple[int, int, int] | None:
-    from PIL import Image
-
-    try:
-        with Image.open(folder / "texture.png") as image:
-            pixels = np.asarray(image.convert("RGB").resize((16, 16), Image.Resampling.BOX))
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-        return None
-    return _rgb(pixels.reshape(-1, 3).mean(axis=0))
-
-
-def _material(folder: Path) -> tuple[int, int, int] | None:
-    try:
-        lines = (folder / "model.mtl").read_text(errors="replace").splitlines()
-        shades = [[float(word) for word in line.split()[1:4]] for line in lines if "Kd " in line]
-        return _rgb(np.clip(np.mean(shades, axis=0), 0, 1) * 255) if shades else None
-    except (OSError, ValueError):
-        return None
-
-
-def _rgb(color: Sequence[float] | np.ndarray) -> tuple[int, int, int] | None:
-    if len(color) != 3 or not np.isfinite(color).all():
-        return None
-    red, green, blue = (round(float(channel)) for channel in color)
-    return red, green, blue

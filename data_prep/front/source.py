@@ -24,7 +24,7 @@ from data_prep.engine.source import (
     sentence_of,
 )
 from data_prep.engine.workers import Run
-from data_prep.front.drawing import prepare_room, rgb_files
+from data_prep.front.drawing import prepare_room
 from data_prep.front.furnished import Room, broken_rule, outside_floor, unknown_categories
 from data_prep.front.houses import House, house_files, parse_house, read_house
 from data_prep.front.models import ModelBank
@@ -51,8 +51,6 @@ class FrontSource:
     """CSV of `room id,split`; None splits 8:1:1 into train, val and test, seeded."""
     seed: int = 0
     only: str | None = None
-    rgb: bool = False
-    """True also renders shaded pictures, `rgb/<room>/<view>.png`; no effect on shards."""
 
     @property
     def label_set(self) -> str:
@@ -76,7 +74,6 @@ class FrontSource:
                 "invalid_models": _digest_of_ids(self.recipe.invalid_models),
             },
             "seed": self.seed,
-            "rgb": self.rgb,
             "splits": None if self.splits is None else digest(Path(self.splits).read_text()),
             "houses": digest_of_files(self._houses(only)),
             "models": digest_of_files([info]),
@@ -136,14 +133,10 @@ class FrontSource:
             return _filtered(room, task.house, self.recipe, *broken)
         pieces = [piece for piece in room.furniture if piece.label != "void"]
         models = {piece.model_id: piece.model for piece in pieces}
-        pictures = {}
-        if self.rgb:
-            colors = [self.bank.color(piece.model_id) for piece in room.furniture]
-            pictures = rgb_files(room, colors, made[0], self.label_set, renderer)
         notes = room.notes
         if outside := outside_floor(room):
             notes += (f"{outside} of {len(room.furniture)} pieces stand outside of the floor",)
-        return PreparedRoom(*made, models, pictures, notes, unknown_categories(room, self.recipe))
+        return PreparedRoom(*made, models, notes, unknown_categories(room, self.recipe))
 
     @property
     def bank(self) -> ModelBank:

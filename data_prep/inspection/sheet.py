@@ -16,9 +16,7 @@ _TILE = (480, 360)
 _GAP_PX, _LINE_PX = 8, 15
 
 
-def draw_sheet(
-    folder: Path, room_id: str | None = None, pictures: int = 24, boxes_3d: bool = True
-) -> Image.Image:
+def draw_sheet(folder: Path, room_id: str | None = None, pictures: int = 24) -> Image.Image:
     """Draw views of a folder, or of one room and its plan, on one sheet; see `legend`."""
     captions: list[str] = []
     tiles: list[np.ndarray] = []
@@ -26,13 +24,13 @@ def draw_sheet(
     for path, name, view in choose_views(folder, room_id, pictures):
         short = name if len(name) <= 56 else f"{name[:8]}...{name[-45:]}"
         with Shard(path) as shard:
-            wires |= boxes_3d and shard.has_ground_truth(name)
+            wires |= shard.has_ground_truth(name)
             if room_id is not None and not tiles:
                 floors = shard.has_stuff(name)
                 captions.append(f"{short}  from above")
                 tiles.append(np.asarray(draw_plan(shard, name, *_TILE)))
             captions.append(f"{short}  view {view}")
-            tiles.append(np.asarray(draw_view(shard, name, view, boxes_3d, _TILE[0])))
+            tiles.append(np.asarray(draw_view(shard, name, view, True, _TILE[0])))
     sheet = contact_sheet(tiles, min(4, len(tiles)), captions, _GAP_PX)
     lines = textwrap.wrap(legend(wires, floors), max(40, sheet.shape[1] // 6))
     borders = ((_LINE_PX * len(lines), _GAP_PX), (0, 0), (0, 0))

@@ -40,7 +40,7 @@ class ToySource:
         assert renderer is None
         number = task.extra["number"]
         views, truth = make_toy_room(task.room_id, np.random.default_rng(number))
-        made = PreparedRoom(views, truth, {"toy": TRIANGLE}, {f"rgb/{number}.txt": b"red"})
+        made = PreparedRoom(views, truth, {"toy": TRIANGLE})
         match self.trouble.get(number):
             case None:
                 return made

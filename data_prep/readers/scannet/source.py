@@ -31,8 +31,8 @@ class ScanNetSource:
     scan_settings: ScanSettings = field(default_factory=ScanSettings)
     train: Path | None = None
     val: Path | None = None
-    """The official lists of 1,201 and 312 scans; `val` becomes the split `test`. None splits the spaces 9:1 by the
-    seed."""
+    """The official lists, of 1,201 and 312 scans; `val` becomes the split `test`. None splits the
+    spaces 9:1 by the seed."""
     seed: int = 0
     only: str | None = None
 

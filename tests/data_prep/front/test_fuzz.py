@@ -36,7 +36,7 @@ def test_a_job_on_damaged_houses_names_every_room(front, tmp_path):
              "required_classes=[]", "min_inside_floor=null", "min_models_share=null",
              "views.at_least=2", "views.per_m2=0.1",
              "views.image_size=[24, 32]", "views.min_object_pixels=4", "views.tries=2")  # fmt: skip
-    summary = build_shards(front_job(front, tmp_path / "shards", rules=rules, rgb=True))
+    summary = build_shards(front_job(front, tmp_path / "shards", rules=rules))
     assert summary.statuses["prepared"] > 30 and summary.statuses["failed"] > 5
     assert len(rooms_of(tmp_path / "shards")) == summary.statuses["prepared"]
     for line in summary.lines:

@@ -1,9 +1,8 @@
-"""3D-FUTURE's models: meshes and colours, read once a process within a budget of memory."""
+"""3D-FUTURE's models: meshes, read once a process within a budget of memory."""
 
 import os
 
 import pytest
-from PIL import Image
 from refusals import refused
 
 from data_prep.front import models
@@ -89,17 +88,3 @@ def test_wrong_folders_of_models(front, tmp_path):
 def test_the_revised_list_of_models(front):
     (front.future / "model_info.json").rename(front.future / "model_info_revised.json")
     assert ModelBank(front.future).category("bed") == "king-size bed"
-
-
-def test_a_models_colour(front):
-    bank = ModelBank(front.future)
-    folder = front.future / "bed"
-    assert bank.color("bed") is None and bank.color("nowhere") is None
-    (folder / "model.mtl").write_text("newmtl a\nKd 1.0 0.5 0\nnewmtl b\nKd 1 0.5 0\n")
-    assert bank.color("bed") == (255, 128, 0)
-    (folder / "model.mtl").write_text("Kd nan x\n")
-    assert bank.color("bed") is None
-    Image.new("RGB", (32, 32), (10, 20, 30)).save(folder / "texture.png")
-    assert bank.color("bed") == (10, 20, 30)
-    (folder / "texture.png").write_bytes((folder / "texture.png").read_bytes()[:60])
-    assert bank.color("bed") is None

@@ -46,10 +46,9 @@ def test_the_legend_explains_what_the_sheet_shows(shards, tmp_path, monkeypatch)
     room = PosedRoom(tmp_path / "rooms" / "attic").write()
     build_shards(Job(PosedSource(room.folder, SET), tmp_path / "posed"))
     draw_sheet(shards, pictures=1)
-    draw_sheet(shards, pictures=1, boxes_3d=False)
     draw_sheet(shards, "house0_Bedroom-0", pictures=1)
     draw_sheet(tmp_path / "posed", "attic", pictures=1)
-    assert drawn == [(True, False), (False, False), (True, True), (False, False)]
+    assert drawn == [(True, False), (True, True), (False, False)]
     # Captures have no ground truth, and nothing in the legend says that they have.
     assert "ground truth" not in legend(False, True) and "From above" not in legend(True, False)
     assert "Black wires: 3D boxes of the ground truth" in legend(True, False)
