@@ -320,9 +320,7 @@ def _verify(shards: Path, room: str | None, workers: int) -> None:
     typer.echo(f"{shards}: {summary(found)}")
 
 
-def run_job(
-    source: "Source", out: Path, workers: int | None, retry_failed: bool = False
-) -> None:
+def run_job(source: "Source", out: Path, workers: int | None, retry_failed: bool = False) -> None:
     """Build shards and print the report, for every `prep-*` command."""
     from rich.console import Console
 
