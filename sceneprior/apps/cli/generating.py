@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from sceneprior.apps.cli import options
+from sceneprior.core.errors import InputError
 from sceneprior.core.files import check_free
 
 BROKEN_TOLD = 5
@@ -203,7 +204,6 @@ def view(
     unless --shell says otherwise.
     """
     from sceneprior.apps.viewer.server import check_can_serve, serving
-    from sceneprior.core.errors import InputError
 
     check_can_serve(host, port)  # before seconds are spent on loading
     drawn = options.checked_shell(shell or "walls")
@@ -218,22 +218,18 @@ def view(
 
     # One room at a time is too little work for several threads.
     torch.set_num_threads(1)
-    folder, stop = Path(where), threading.Event()
+    folder = Path(where)
     is_folder = folder.is_dir() and not (folder / "config.yaml").is_file()
+    if asked and is_folder:
+        raise InputError(
+            f"{where} holds scenes, which are shown as they are; a request needs a prior."
+        )
     try:
-        if asked and is_folder:
-            raise InputError(
-                f"{where} holds scenes, which are shown as they are; a request needs a prior."
-            )
         source = Folder(load_scene_folder(folder)) if is_folder else Explorer(load(where))
         bank = None if models is None else open_models(models, source.label_set, cache)
         with serving(host, port) as server:
             open_page(server, source, folder.name, bank, with_floor_of_file(asked), drawn)
             typer.echo(f"Open http://localhost:{port} in a browser. Ctrl-C ends it.")
-            if isinstance(source, Explorer):
-                threading.Thread(target=source.find_meshes, args=(stop,)).start()
-            stop.wait()
+            threading.Event().wait()
     except KeyboardInterrupt:
         typer.echo("\nStopped: the page is closed.")
-    finally:
-        stop.set()

@@ -1,6 +1,5 @@
 """The viewer's rooms, without a page: those of a trained prior, or of a folder of scenes."""
 
-import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -19,7 +18,6 @@ from sceneprior.core.scene import Scene
 from sceneprior.evaluation.metrics.contents import common_label_set
 from sceneprior.evaluation.metrics.novelty import nearest_room
 from sceneprior.lifted.config import SAMPLER, TrainedLifted
-from sceneprior.lifted.prototype_decoder import PrototypeDecoder
 from sceneprior.paper.decode import decode_latents, to_rooms
 from sceneprior.paper.interpolate import RoomPath, even_places
 from sceneprior.paper.prior import TrainedPrior, with_training_latents
@@ -214,15 +212,6 @@ class Explorer:
         target = trained.config.model.completeness_target
         rooms = to_rooms(decoded, trained.prior, self.label_set, trained.room_ids, target)
         return [room.scene for room in rooms]
-
-    def find_meshes(self, stop: threading.Event) -> None:
-        """Extract the meshes of all shape prototypes in advance, so that no room has to wait."""
-        trained = self.prior.trained
-        if isinstance(trained, TrainedPrior) and isinstance(trained.prior.shape, PrototypeDecoder):
-            for prototype in trained.prior.shape.known:
-                if stop.is_set():
-                    return
-                trained.prior.shape.surface(prototype)
 
 
 def floor_side_m(scenes: Sequence[Scene]) -> float:

@@ -7,8 +7,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from sceneprior.apps.retrieval.cad_models import CadModels
 from sceneprior.apps.viewer.explorer import HERE, NOTHING_ASKED, PATH_STEPS, Explorer, Folder
 from sceneprior.apps.viewer.page import Page
@@ -250,9 +248,10 @@ class RequestFields:
     """
 
     def __init__(self, gui: Any, asked: Mapping[str, Any]):
-        texts, self._rest = _texts_of(asked)
+        texts = {key: value for key, value in asked.items() if isinstance(value, str | float | int)}
+        self._rest = {key: value for key, value in asked.items() if key not in texts}
         self.fields: dict[str, Any] = {
-            key: gui.add_text(label, texts[key], multiline=key == "want", hint=hint)
+            key: gui.add_text(label, str(texts.get(key, "")), multiline=key == "want", hint=hint)
             for key, (label, hint) in _FIELDS.items()
         }
         names = ", ".join(key.removesuffix("_m") for key in self._rest)
@@ -292,24 +291,6 @@ class RequestFields:
         for field in self.fields.values():
             field.value = ""
         self._rest, self.rest_text.visible = {}, False
-
-
-def _texts_of(asked: Mapping[str, Any]) -> tuple[dict[str, str], dict[str, Any]]:
-    """Split a request into texts for the fields, and parts without a field."""
-    texts, rest = dict.fromkeys(_FIELDS, ""), {}
-    for key, value in asked.items():
-        if key == "ceiling_m":
-            texts[key] = f"{value:g}"
-        elif key in texts and isinstance(value, str):
-            texts[key] = value
-        elif key == "floor":
-            corners = np.asarray(value).tolist()
-            texts[key] = " ".join(f"{round(x, 3):g},{round(z, 3):g}" for x, z in corners)
-        elif key == "openings" and all(isinstance(each, str) for each in value):
-            texts[key] = ", ".join(value)
-        else:
-            rest[key] = value
-    return texts, rest
 
 
 def download(scene: Scene, form: str, shell: ShellName) -> tuple[str, bytes, list[str]]:

@@ -1,6 +1,5 @@
 """What a page can ask for, without a page: the same rooms as the commands make."""
 
-import threading
 from dataclasses import replace
 
 import numpy as np
@@ -107,19 +106,6 @@ def test_the_nearest_training_room(explorer, prior):
     assert same(shown.scene, next(room for room in rooms if room.name == shown.scene.name))
 
 
-def test_of_a_sampler_s_run_all_meshes_are_found_ahead(sampler_run):
-    explorer = Explorer(sceneprior.load(sampler_run))
-    assert explorer.distributions[0] == "sampler" and explorer.sample(0).scene.latent is None
-    shapes = explorer.prior.trained.prior.shape
-    stopped = threading.Event()
-    stopped.set()
-    before = len(shapes._meshes)
-    explorer.find_meshes(stopped)
-    assert len(shapes._meshes) == before < len(shapes.known)
-    explorer.find_meshes(threading.Event())
-    assert sorted(shapes._meshes) == shapes.known
-
-
 def test_without_latents_of_rooms_there_are_new_rooms_and_no_map(prior):
     bare = replace(prior.trained, logits=prior.trained.logits[:0], room_ids=())
     explorer = Explorer(Prior(bare, "bare"))
@@ -139,7 +125,6 @@ def test_a_method_without_a_latent_space_samples(toy_shards):
     assert explorer.map is None and not explorer.has_latents and explorer.distributions == ()
     assert "which has no latent space" in explorer.without_map
     assert explorer.sample(0).origin == "seed 0, from: atiss"
-    explorer.find_meshes(threading.Event())
 
 
 def test_a_folder_s_rooms():
