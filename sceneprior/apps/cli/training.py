@@ -109,11 +109,10 @@ def compare(
 ) -> None:
     """Train and evaluate methods on the same rooms, and tabulate them; run again to continue."""
     from sceneprior.apps.experiments.compare import compare as run_comparison
-    from sceneprior.apps.experiments.comparison import part_of
-    from sceneprior.apps.experiments.runs import load_comparison
+    from sceneprior.apps.experiments.runs import load_comparison, part_of
 
     comparison = load_comparison(config)
-    part = part_of(comparison, methods, rooms, seeds)
+    part = part_of(comparison, out, methods, rooms, seeds)
     with _stopped_by_ctrl_c():
         done = run_comparison(comparison, part, out, inception, accelerator)
     if done.table is not None:

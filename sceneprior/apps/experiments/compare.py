@@ -5,6 +5,7 @@ alone. Finished commands are not repeated.
 """
 
 import hashlib
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -38,12 +39,12 @@ class Compared(NamedTuple):
 
 def compare(
     comparison: Comparison,
-    part: Comparison,
+    part: Sequence[Run],
     out: Path,
     inception: Path | None = None,
     accelerator: str = "auto",
 ) -> Compared:
-    """Finish the runs of `part`, then write the tables of all finished runs.
+    """Finish the runs of `part` (those of `runs_of`), then write the tables of all finished runs.
 
     The folder of a run is `<out>/<rooms>/<method>/seed<k>/`; tables are written to `out`. Ctrl-C,
     SIGTERM and SIGHUP raise KeyboardInterrupt; a second, identical call continues.
@@ -55,16 +56,16 @@ def compare(
     if inception is not None:
         check_inception(inception)
     count = cache(lambda rooms: count_of(comparison, rooms))
-    for rooms in part.rooms:
-        count(rooms)  # unusable shards raise here, before anything is trained
-    asked, done, failures, left_out = runs_of(part, out), list[Run](), list[str](), list[str]()
+    for run in part:
+        count(run.rooms)  # unusable shards raise here, before anything is trained
+    done, failures, left_out = list[Run](), list[str](), list[str]()
     with only_writer(out):
         for run in runs_of(comparison, out):
             evaluated = (run.folder / "scores.json").is_file()
-            if run not in asked and not evaluated:
+            if run not in part and not evaluated:
                 continue
             commands = commands_of(comparison, run, count(run.rooms), inception, accelerator)
-            if run in asked and (failure := _finish(run, commands)):
+            if run in part and (failure := _finish(run, commands)):
                 failures.append(f"{run.title}: {failure}")
             elif keeps_settings(run) and all(is_done(each, run.folder) for each in commands):
                 done.append(run)

@@ -1,13 +1,11 @@
 """Settings of `sceneprior compare`: kinds of rooms, methods, seeds and the task."""
 
-from collections.abc import Iterable
 from typing import Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from sceneprior.core.errors import ConfigError, InputError
 from sceneprior.core.repeatable import LARGEST_SEED
-from sceneprior.core.settings import Section, check_settings, read_settings
+from sceneprior.core.settings import Section
 
 EVERY = "every"
 """Key of `Method.set` for settings that apply to every kind of room."""
@@ -130,45 +128,3 @@ class ViewComparison(Comparison):
 
 TASKS: dict[str, type[Comparison]] = {"new_rooms": RoomComparison, "single_views": ViewComparison}
 """Class of the comparison, by the value of the key `task`."""
-
-
-def read_comparison(name: str) -> tuple[str, Comparison]:
-    """Read a comparison; returns its path, too. `runs.load_comparison` also checks its runs."""
-    path, data = read_settings(name)
-    task = data.get("task", "new_rooms")
-    if not isinstance(task, str) or task not in TASKS:
-        raise ConfigError(f"{path}: no task is called '{task}'; choose from {', '.join(TASKS)}.")
-    return str(path), check_settings(TASKS[task], data, str(path))
-
-
-def part_of(
-    comparison: Comparison, methods: str | None, rooms: str | None, seeds: str | None
-) -> Comparison:
-    """The part of a comparison with the given methods, kinds of rooms and seeds, each as `a,b`;
-    None means all."""
-    chosen = {
-        "methods": _chosen("method", methods, comparison.methods),
-        "rooms": _chosen("kind of rooms", rooms, comparison.rooms),
-        "seeds": _chosen("seed", seeds, map(str, comparison.seeds)),
-    }
-    return comparison.model_copy(
-        update={
-            "methods": {name: comparison.methods[name] for name in chosen["methods"]},
-            "rooms": {name: comparison.rooms[name] for name in chosen["rooms"]},
-            "seeds": tuple(map(int, chosen["seeds"])),
-        }
-    )
-
-
-def _chosen(what: str, given: str | None, known: Iterable[str]) -> list[str]:
-    """The named ones, in the order of `known`."""
-    known = list(known)
-    if given is None:
-        return known
-    names = [name.strip() for name in given.split(",") if name.strip()]
-    for name in names:
-        if name not in known:
-            raise InputError(f"No {what} '{name}' in this comparison; it has {', '.join(known)}.")
-    if not names:
-        raise InputError(f"No {what} was named; the comparison has {', '.join(known)}.")
-    return [name for name in known if name in names]

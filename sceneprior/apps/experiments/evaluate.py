@@ -13,7 +13,7 @@ from sceneprior.apps.experiments.evaluate_views import (
     evaluate_from_views,
     mask_scores,
 )
-from sceneprior.apps.experiments.runs import GIVEN, generated_by
+from sceneprior.apps.experiments.runs import GIVEN, made_by_run
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import write_json
@@ -175,7 +175,7 @@ def report_run(
         if known_in_3d(shards, "train"):
             decoded = decoded_and_true(trained, shards, meshes=True)
         unfolding = unfold(trained)
-    method = generated_by(config, trained.distribution)[0] or f"the method {config.method}"
+    method = made_by_run(config, trained.distribution)[0] or f"the method {config.method}"
     made_by = f"{method}, which learns from {config.learns_from}"
     if isinstance(trained, TrainedPrior):
         made_by += f"; rooms drawn by: {marked(trained.distribution)}"

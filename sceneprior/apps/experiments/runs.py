@@ -9,25 +9,40 @@ from typing import Any
 from sceneprior.apps.config import load_config
 from sceneprior.apps.experiments.comparison import (
     EVERY,
+    TASKS,
     Comparison,
     Method,
     RoomComparison,
     Rooms,
     ViewComparison,
-    read_comparison,
 )
 from sceneprior.apps.reconstruction.reconstruct import OBJECTS
-from sceneprior.core.errors import ConfigError
-from sceneprior.core.settings import read_settings
+from sceneprior.core.errors import ConfigError, InputError
+from sceneprior.core.settings import check_settings, read_settings
 from sceneprior.lifted.config import SAMPLER, LiftedConfig
 from sceneprior.paper.config import PaperConfig
 from sceneprior.training.method import RunConfig
 
 PAPER, LIFTED = "the paper's method and variations of it", "the lifted method"
 LIFTED_BOXES = "the paper's network and latents trained on lifted boxes"
-BASELINES = "baselines"
 GIVEN = "scenes as given, which were made elsewhere"
-"""Names of methods in captions, and of scenes that no method of this package made."""
+LATENTS, FIT = "latents", "fit"
+ROWS = {
+    (LATENTS, False): ("Paper's method", "", PAPER),
+    (LATENTS, True): (
+        "Paper's sphere, trained on lifted boxes", "trained on lifted boxes", LIFTED_BOXES,
+    ),
+    (SAMPLER, True): ("Lifted method: sampler", "sampler of the lifted method", LIFTED),
+    (FIT, False): ("Paper: fit of a latent", "fit of a latent", PAPER),
+    (FIT, True): (
+        "Fit of a latent, trained on lifted boxes", "fit of a latent, trained on lifted boxes",
+        LIFTED_BOXES,
+    ),
+    (OBJECTS, False): ("Object by object, by the paper's prior", "object by object", LIFTED),
+    (OBJECTS, True): ("Object by object", "object by object", LIFTED),
+}  # fmt: skip
+"""Title of a row, text to append to a title of the user's, and the method's name in captions, by
+the way in which rooms are made and by whether the run is of the lifted method."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +87,11 @@ class Variant:
 
 def load_comparison(name: str) -> Comparison:
     """Read a comparison and check the settings of each of its runs."""
-    path, comparison = read_comparison(name)
+    path, data = read_settings(name)
+    task = data.get("task", "new_rooms")
+    if not isinstance(task, str) or task not in TASKS:
+        raise ConfigError(f"{path}: no task is called '{task}'; choose from {', '.join(TASKS)}.")
+    comparison = check_settings(TASKS[task], data, str(path))
     rows: dict[tuple[str, str], str] = {}
     for run in runs_of(comparison, Path()):
         for variant in variants_of(comparison, run):
@@ -108,6 +127,39 @@ def runs_of(comparison: Comparison, out: Path) -> list[Run]:
                 config = method.config or rooms.config
                 runs.append(Run(key, name, seed, config, settings, folder / f"seed{seed}"))
     return runs
+
+
+def part_of(
+    comparison: Comparison,
+    out: Path,
+    methods: str | None = None,
+    rooms: str | None = None,
+    seeds: str | None = None,
+) -> list[Run]:
+    """The runs of the given methods, kinds of rooms and seeds, each as `a,b`; None means all."""
+    known = {
+        "method": (methods, list(comparison.methods)),
+        "kind of rooms": (rooms, list(comparison.rooms)),
+        "seed": (seeds, [str(seed) for seed in comparison.seeds]),
+    }
+    chosen = {}
+    for what, (given, names) in known.items():
+        asked = names if given is None else [name.strip() for name in given.split(",")]
+        chosen[what] = asked = [name for name in asked if name]
+        for name in asked:
+            if name not in names:
+                raise InputError(
+                    f"No {what} '{name}' in this comparison; it has {', '.join(names)}."
+                )
+        if not asked:
+            raise InputError(f"No {what} was named; the comparison has {', '.join(names)}.")
+    return [
+        run
+        for run in runs_of(comparison, out)
+        if run.method in chosen["method"]
+        and run.rooms in chosen["kind of rooms"]
+        and (run.seed is None or str(run.seed) in chosen["seed"])
+    ]
 
 
 def _of_rooms(rooms: Rooms, method: Method) -> list[str]:
@@ -154,42 +206,19 @@ def variants_of(comparison: Comparison, run: Run) -> list[Variant]:
         names = (*own, *comparison.distributions)
     found = []
     for name in names:
-        plain, detail, made_by = (
-            reconstructed_by(config, name or OBJECTS) if views else generated_by(config, name)
-        )
+        way = name if not views else OBJECTS if name in (None, OBJECTS) else FIT
+        plain, detail, made_by = made_by_run(config, way)
         row = plain if title is None else ", ".join(filter(None, (title, detail)))
         file = "scores.json" if name == names[0] else f"scores_{name}.json"
         found.append(Variant(name, row, made_by, run.folder / file))
     return found
 
 
-def generated_by(config: RunConfig, distribution: str | None) -> tuple[str, str, str]:
-    """The method with which a run draws new rooms; if `distribution` is None, it is the run's
-    default.
-
-    Returns:
-        The title of its row, text to append to a title of the user's, and its name in captions.
-    """
+def made_by_run(config: RunConfig, way: str | None = None) -> tuple[str, str, str]:
+    """The entry of `ROWS` for a run and a way to make rooms: `OBJECTS`, `FIT`, or a distribution of
+    new rooms (None: the run's default). Other methods are baselines, without a title."""
     if not isinstance(config, PaperConfig | LiftedConfig):
-        return "", "", BASELINES
-    if (distribution or config.distribution) == SAMPLER:
-        return "Lifted method: sampler", "sampler of the lifted method", LIFTED
-    if isinstance(config, LiftedConfig):
-        title = "Paper's sphere, trained on lifted boxes"
-        return title, "trained on lifted boxes", LIFTED_BOXES
-    return "Paper's method", "", PAPER
-
-
-def reconstructed_by(config: RunConfig, fit: str) -> tuple[str, str, str]:
-    """The method with which a run reconstructs rooms, as `generated_by`; `fit` is the option of
-    `eval-svr`."""
-    if not isinstance(config, PaperConfig | LiftedConfig):
-        return "", "", BASELINES
-    lifted = isinstance(config, LiftedConfig)
-    if fit == OBJECTS:
-        title = "Object by object" if lifted else "Object by object, by the paper's prior"
-        return title, "object by object", LIFTED
-    if lifted:
-        detail = "fit of a latent, trained on lifted boxes"
-        return detail.capitalize(), detail, LIFTED_BOXES
-    return "Paper: fit of a latent", "fit of a latent", PAPER
+        return "", "", "baselines"
+    way = way or config.distribution
+    way = way if way in (SAMPLER, FIT, OBJECTS) else LATENTS
+    return ROWS[way, isinstance(config, LiftedConfig)]

@@ -7,8 +7,7 @@ from made_results import METHODS, write_comparison, write_new_rooms, write_views
 
 from sceneprior.apps.experiments import table
 from sceneprior.apps.experiments.compare import commands_of
-from sceneprior.apps.experiments.comparison import part_of
-from sceneprior.apps.experiments.runs import load_comparison, runs_of, variants_of
+from sceneprior.apps.experiments.runs import load_comparison, part_of, runs_of, variants_of
 from sceneprior.apps.experiments.table import VIEWS, Row, markdown, write_tables
 
 GOLDEN = Path(__file__).parents[2] / "golden" / "apps"
@@ -23,7 +22,7 @@ def test_shipped_comparisons_run_the_same_commands_for_the_same_rows():
     ):
         comparison = load_comparison(f"compare/{name}.yaml")
         lines.append(f"# {name}")
-        for run in runs_of(part_of(comparison, None, rooms, "0"), Path("out")):
+        for run in part_of(comparison, Path("out"), rooms=rooms, seeds="0"):
             count = None if name == "single_view" else 149
             rows = {
                 variant.result.stem: f"{variant.title} | {variant.made_by}"
