@@ -15,8 +15,7 @@ from sceneprior.interchange.front import write_front
 from sceneprior.interchange.habitat import write_habitat
 from sceneprior.interchange.sceneeval import write_sceneeval
 from sceneprior.render.scene_files import check_names, save
-from sceneprior.render.scene_mjcf import scene_to_mjcf
-from sceneprior.render.scene_usd import scene_to_usd
+from sceneprior.render.scene_simulators import scene_to_mjcf, scene_to_usd
 
 
 def _write_mujoco(scenes: Sequence[Scene], folder: Path, shell: ShellName) -> None:

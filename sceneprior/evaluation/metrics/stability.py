@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene
 from sceneprior.evaluation.metric import USED, Counts, metric
-from sceneprior.render.scene_mjcf import TIMESTEP_S, scene_to_mjcf
+from sceneprior.render.scene_simulators import TIMESTEP_S, scene_to_mjcf
 
 SECONDS = 5.0
 MOVED_M, TURNED_RAD = 0.01, 0.1

@@ -19,7 +19,7 @@ from sceneprior.lifted.lifting.hulls import (
     pass_through,
     sightings_of,
 )
-from sceneprior.render.silhouettes.cpu.threads import in_threads
+from sceneprior.render.silhouettes.cpu.kernels import in_threads
 
 GRIDS = ((16, 0.6), (24, 0.6), (40, 0.4), (40, 0.4))
 """Grids, coarse to fine: cells along an edge, and `reach` (see `carve`). Each grid spans the box

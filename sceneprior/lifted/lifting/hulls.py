@@ -13,7 +13,7 @@ from numba import njit
 
 from sceneprior.core.shards import RoomViews
 from sceneprior.lifted.lifting import LiftedBoxes, ShapeGrid
-from sceneprior.render.silhouettes.cpu.threads import in_threads
+from sceneprior.render.silhouettes.cpu.kernels import in_threads
 
 MOST_EMPTY = 0.35
 """Largest emptiness of a cell in any hull, even if rays then stay unexplained; see

@@ -20,7 +20,7 @@ from sceneprior.lifted.prototypes import (
     turn_of,
     turned_extents,
 )
-from sceneprior.render.silhouettes.cpu.threads import in_threads, thread_count
+from sceneprior.render.silhouettes.cpu.kernels import in_threads, thread_count
 
 RAYS = 4096
 """Number of rays to which the parts of a prototype are fitted."""

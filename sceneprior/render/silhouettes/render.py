@@ -151,9 +151,7 @@ def render_scene(
         backend = backend if backend in BACKENDS else "reference"
     moving_cameras = world_to_camera.requires_grad or intrinsics.requires_grad
     if backend == "cpu" and not moving_cameras:
-        from sceneprior.render.silhouettes.cpu.projection import (
-            project_in_threads,  # imported here, since it imports Numba
-        )
+        from sceneprior.render.silhouettes.cpu.backend import project_in_threads
 
         pixels, depths = project_in_threads(vertices_m, world_to_camera, intrinsics)
     else:

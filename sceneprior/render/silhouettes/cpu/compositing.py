@@ -20,7 +20,7 @@ Objects are ordered by their depth at the pixel (see faces.py); the order carrie
 import numpy as np
 from numba import njit
 
-from sceneprior.render.silhouettes.cpu.threads import in_threads
+from sceneprior.render.silhouettes.cpu.kernels import in_threads
 
 MODES = ("alone", "layered", "paper")
 ALONE, LAYERED, PAPER = range(3)

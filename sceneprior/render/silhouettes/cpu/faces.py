@@ -16,9 +16,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from sceneprior.render.silhouettes.cpu.threads import in_threads
-from sceneprior.render.silhouettes.cpu.vector_exp import vector_exp
-from sceneprior.render.silhouettes.cpu.windows import pixel_range
+from sceneprior.render.silhouettes.cpu.kernels import in_threads, pixel_range, vector_exp
 from sceneprior.render.silhouettes.reference import MIN_AREA_PX2, SLACK
 
 _LOOSE: Any = {"contract", "reassoc", "nsz", "arcp"}

@@ -14,10 +14,14 @@ docs/silhouettes.md shows the difference from the exact formula.
 import numpy as np
 from numba import njit
 
-from sceneprior.render.silhouettes.cpu.threads import in_threads
-from sceneprior.render.silhouettes.cpu.windows import pixel_range
-from sceneprior.render.silhouettes.reference import ASIDE_PX, MIN_AREA_PX2, PIECE_PX, SLACK
-from sceneprior.render.silhouettes.topology import topology_of
+from sceneprior.render.silhouettes.cpu.kernels import in_threads, pixel_range
+from sceneprior.render.silhouettes.reference import (
+    ASIDE_PX,
+    MIN_AREA_PX2,
+    PIECE_PX,
+    SLACK,
+    topology_of,
+)
 
 
 @njit(error_model="numpy", nogil=True)

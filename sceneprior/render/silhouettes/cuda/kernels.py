@@ -13,7 +13,7 @@ deterministic. `missed` is 1 - coverage, the probability that the mesh misses th
                      certify_pieces      per few pieces    pieces without a face beyond them
                      trace_tiles         per packed tile   missed, order value, nearest piece
                      end_gradients       per few pieces    gradient of the edge's ends
-    compositing      composite_tiles     per image tile    masks, front, depth
+    backend          composite_tiles     per image tile    masks, front, depth
                      composite_backward  per image tile    gradient of packed pixels
 
 `cover_tiles` and `faces` implement the exact mode, `outline_kernels` the fast mode. Block shapes

@@ -16,8 +16,7 @@ from torch.utils.weak import WeakTensorKeyDictionary
 from sceneprior.render.silhouettes.cuda import outline_kernels as kernels
 from sceneprior.render.silhouettes.cuda.faces import sum_by_vertex
 from sceneprior.render.silhouettes.cuda.windows import Windows, launch, reach_of
-from sceneprior.render.silhouettes.reference import ASIDE_PX, PIECE_PX, Settings
-from sceneprior.render.silhouettes.topology import topology_of
+from sceneprior.render.silhouettes.reference import ASIDE_PX, PIECE_PX, Settings, topology_of
 
 
 class Edges(NamedTuple):

@@ -19,8 +19,7 @@ from torch.testing import assert_close
 
 from sceneprior.core.cameras import project
 from sceneprior.core.meshes import icosphere
-from sceneprior.render.silhouettes.cpu.threads import in_threads
-from sceneprior.render.silhouettes.cpu.windows import windows_of
+from sceneprior.render.silhouettes.cpu.kernels import in_threads, windows_of
 from sceneprior.render.silhouettes.reference import Settings
 from sceneprior.render.silhouettes.render import NEAR_FACE_M, render_scene, render_silhouettes
 
@@ -133,7 +132,7 @@ def test_torch_keeps_its_number_of_threads():
     # In a process of its own: Numba starts its pool, which sets torch's threads, once in each.
     code = """
 import numba, torch
-from sceneprior.render.silhouettes.cpu.threads import in_threads
+from sceneprior.render.silhouettes.cpu.kernels import in_threads
 torch.set_num_threads(1)
 torch.get_num_threads()  # only now, or by a large sum, does torch ask OpenMP for them
 in_threads(lambda first, last: None, 9)
