@@ -1,21 +1,16 @@
 """Runs of all baselines: they train, stop, resume, generate, and are evaluated and reported."""
 
-import csv
-
 import pytest
 import torch
 from interrupting import CPU, interrupted
 from toy_metrics import without_classifiers
-from typer.testing import CliRunner
 
-from sceneprior.apps.cli.commands import app
 from sceneprior.apps.config import load_any_run
 from sceneprior.apps.experiments.evaluate import evaluate_run, report_run
 from sceneprior.apps.sample import sample_rooms
-from sceneprior.core.settings import dump_settings
 from sceneprior.evaluation.room_sets import without_void
 from sceneprior.evaluation.synthesis import EvalOptions
-from sceneprior.training.checkpoints import find_checkpoint, read_checkpoint
+from sceneprior.training.checkpoints import read_checkpoint
 from sceneprior.training.fit import fit
 
 LOGGED = {
@@ -40,20 +35,6 @@ def no_classifier(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("method", LOGGED)
-def test_a_run_leaves_its_checkpoints_and_curves(baseline_run, method):
-    run, stages = baseline_run(method), STAGES[method]
-    assert {path.name for path in run.iterdir()} == {"config.yaml", *stages}
-    last = stages[-1]
-    assert find_checkpoint(run, stages) == (last, run / last / "final.ckpt")
-    with (run / last / "metrics.csv").open(newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["train/loss"]]
-    assert rows and all(row[f"train/{name}"] for row in rows for name in LOGGED[method])
-    if method in ("atiss", "sync2gen", "set_flow"):
-        assert float(rows[-1]["train/loss"]) < float(rows[0]["train/loss"])
-    assert not load_any_run(run).prior.training
-
-
-@pytest.mark.parametrize("method", LOGGED)
 def test_an_interrupted_and_resumed_run_reaches_the_same_weights(
     baseline_config, baseline_run, method, tmp_path
 ):
@@ -71,21 +52,6 @@ def test_an_interrupted_and_resumed_run_reaches_the_same_weights(
     for one, other in zip(wanted["optimizer_states"], reached["optimizer_states"], strict=True):
         for key, moments in one["state"].items():
             assert torch.equal(moments["exp_avg_sq"], other["state"][key]["exp_avg_sq"])
-
-
-@pytest.mark.parametrize("method", ("atiss2d", "gan"))
-def test_the_command_line_trains_generates_and_evaluates(baseline_config, method, tmp_path):
-    epochs = ("layout__epochs", "shape__epochs") if method == "atiss2d" else ("training__epochs",)
-    config, run = tmp_path / "tiny.yaml", tmp_path / "run"
-    dump_settings(baseline_config(method, **dict.fromkeys(epochs, 1)), config)
-    for words in (
-        ["fit", "--config", str(config), "--run", str(run), "--accelerator", "cpu"],
-        ["synthesize", "--run", str(run), "-n", "3", "--out", str(tmp_path / "rooms")],
-        ["eval-fid", "--run", str(run), "-n", "4", "--resamples", "5"],
-    ):  # fmt: skip
-        result = CliRunner().invoke(app, words)
-        assert result.exit_code == 0, result.output
-    assert len(list((tmp_path / "rooms").rglob("*.glb"))) == 3
 
 
 @pytest.mark.parametrize("method", ("atiss2d", *WITHOUT_LATENTS))
@@ -110,7 +76,7 @@ def test_new_rooms_depend_on_the_seed_alone(baseline_run, method):
         assert not any(yaws)
 
 
-@pytest.mark.parametrize("method", WITHOUT_LATENTS)
+@pytest.mark.parametrize("method", ("gan", "atiss"))
 def test_a_run_is_evaluated_and_reported_by_its_new_rooms_alone(baseline_run, method, tmp_path):
     run, options = baseline_run(method), EvalOptions(resamples=5)
     scores = evaluate_run(run, 4, options, tmp_path / "scores.json")

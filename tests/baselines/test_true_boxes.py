@@ -1,22 +1,17 @@
 """True boxes as batches: what they say, how rooms turn, and who may read them."""
 
 import ast
-import shutil
 from collections import defaultdict
 from pathlib import Path
 
-import h5py
 import numpy as np
-import pytest
 import torch
 
 import sceneprior
 from sceneprior.baselines.true_boxes import TruthDataset
 from sceneprior.core.boxes import box_corners
 from sceneprior.core.dataset import BLANK, ViewDataset
-from sceneprior.core.errors import ShardError
-from sceneprior.core.shards import Shard, iterate_rooms
-from sceneprior.training.fit import fit
+from sceneprior.core.shards import iterate_rooms
 
 PACKAGE = Path(sceneprior.__file__).parent
 UNMIRRORED = [(row, row % 2) for row in range(8, 12)]
@@ -114,26 +109,6 @@ def test_two_epochs_show_a_room_in_its_eight_symmetries(toy_shards, torch_rng):
 def test_a_process_without_a_room_of_its_own_gets_nothing_in_no_room(toy_shards):
     batch = TruthDataset(toy_shards, "train").__getitems__([(3, BLANK)])
     assert batch.room_ids == () and not batch.is_object.any() and not batch.object_class.any()
-
-
-@pytest.mark.parametrize("method", ("atiss", "sync2gen", "set_flow", "total3d", "im3d"))
-def test_methods_under_3d_supervision_refuse_shards_without_it(
-    baseline_config, toy_shards, tmp_path, method
-):
-    blind = shutil.copytree(toy_shards, tmp_path / "blind")
-    with h5py.File(blind / "train" / "part_000.h5", "r+") as file:
-        del next(iter(file["rooms"].values()))["ground_truth"]
-    sentence = r"part_000.h5, room toy/train_00 carries no 3D ground truth.*\(paper, lifted, "
-    sentence += r"gan, usl\)"
-    with pytest.raises(ShardError, match=sentence):
-        fit(baseline_config(method, data__shards=str(blind)), tmp_path / "run")
-    assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize("method", ("atiss2d", "gan", "usl"))
-def test_methods_under_2d_supervision_never_read_it(baseline_config, tmp_path, monkeypatch, method):
-    monkeypatch.setattr(Shard, "read_ground_truth", None)
-    fit(baseline_config(method), tmp_path / "run", trainer_options={"accelerator": "cpu"})
 
 
 def test_only_baselines_with_3d_supervision_read_the_ground_truth():

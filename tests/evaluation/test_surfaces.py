@@ -5,10 +5,9 @@ import pytest
 import trimesh
 from references.surfaces import triangles_meet, winding
 
-from sceneprior.core.scene import Mesh, SceneObject, Turned
+from sceneprior.core.scene import SceneObject
 from sceneprior.evaluation.surfaces import (
     edge_hits,
-    footprint,
     inside,
     meeting_pairs,
     triangles_of,
@@ -71,21 +70,3 @@ def test_voxels_are_those_of_trimesh(pitch_m):
         assert np.allclose(ours.first * pitch_m, theirs.translation)
         # Points of the two divisions differ, so cells that a surface cuts at a corner may.
         assert (ours.cells != theirs.matrix).mean() < 0.02
-
-
-def test_a_hollow_box_is_filled():
-    box = triangles_of(SceneObject("desk", (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)))
-    assert voxelize(box, 0.1).cells.sum() == 11**3
-
-
-def test_surfaces_are_meshes_or_own_boxes():
-    turned = SceneObject(
-        "desk", (1.0, 0.5, 0.0), (2**0.5, 1.0, 2**0.5), turned=Turned(np.pi / 4, (1.0, 1.0, 1.0))
-    )
-    assert np.allclose(np.linalg.norm(footprint(turned) - [1, 0], axis=1), 0.5**0.5)
-    corners = triangles_of(turned).reshape(-1, 3)
-    assert np.isclose(corners[:, 0].max(), 1 + 0.5**0.5)
-    mesh = Mesh(np.eye(3), np.array([[0, 1, 2]]))
-    assert np.array_equal(
-        triangles_of(SceneObject("desk", (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), mesh)), np.eye(3)[None]
-    )

@@ -7,7 +7,7 @@ import pytest
 
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import SceneObject
-from sceneprior.evaluation.view_scores import ObjectPair, score_pair, score_views, surface_note
+from sceneprior.evaluation.view_scores import ObjectPair, score_pair, score_views
 from sceneprior.render.appearance import box_mesh
 
 POINTS = 4000
@@ -36,28 +36,6 @@ def test_a_box_found_half_aside():
     per_way = (0.5 * 1 + 4 * 0.5 * 0.25) / 6
     inside = 0.5  # the side that lies within the other box sees a side half a metre away, too
     assert 2 * per_way < score.chamfer_l2_m < 2 * (per_way + inside / 6) + 0.05
-
-
-def test_the_same_object_is_found_perfectly_but_for_the_points():
-    score = score_pair(ObjectPair(BED, BED), POINTS)
-    assert score.box_iou_3d == pytest.approx(1) and score.oriented_box_iou_3d == pytest.approx(1)
-    # Points as dense as 4,000 on 16 square metres lie half of sqrt(1 / density) from the nearest of
-    # another draw, each way; a circle of 5 cm holds density * pi * 0.05**2 of them on average.
-    density = POINTS / 16
-    assert score.chamfer_l2_m == pytest.approx(density**-0.5, rel=0.05)
-    assert score.class_right
-    assert score.f_score == pytest.approx(1 - np.exp(-density * np.pi * 0.05**2), abs=0.02)
-
-
-def test_a_mesh_counts_and_its_turn_shows_in_the_oriented_box():
-    turn = np.array([[1, 0, 1], [0, 2**0.5, 0], [-1, 0, 1]]) / 2**0.5
-    box = box_mesh((0.0, 0.5, 0.0), (1.0, 1.0, 1.0))
-    turned = replace(box, vertices_m=box.vertices_m @ turn.T)
-    wide = 2**0.5
-    found = SceneObject("desk", (0.0, 0.5, 0.0), (wide, 1.0, wide), turned)
-    score = score_pair(ObjectPair(replace(DESK, mesh=box), found), POINTS)
-    assert score.box_iou_3d == pytest.approx(0.5)  # 1 of 2 square metres of floor
-    assert score.oriented_box_iou_3d == pytest.approx(2**0.5 / 2)  # a square and an octagon
 
 
 def test_every_object_weighs_the_same_and_nothing_found_is_no_number():
@@ -90,14 +68,6 @@ def test_a_box_is_no_surface():
     assert all(one[name] == two[name] for name in unknown)
     bare = score_views([mixed[0][1:]], ["a"], POINTS)["summary"]
     assert bare["with_surface"] == 0 and all(bare[name] is None for name in unknown)
-
-
-def test_why_metrics_of_surfaces_stand_on_fewer_objects():
-    assert surface_note(3, 3, "SHARDS") is None
-    some, none = surface_note(5, 3, "SHARDS"), surface_note(5, 0, "SHARDS")
-    assert some.startswith("2 of 5 true objects have a box but no surface")
-    assert "reported only for the other 3" in some and "SHARDS may be older" in some
-    assert none.startswith("5 of 5") and "are reported for none" in none
 
 
 def test_intervals_are_over_rooms_and_not_over_views():

@@ -49,17 +49,6 @@ def test_answers_are_those_of_folds_never_seen_with_equal_numbers_on_both_sides(
     assert accuracy(told).value == 0.5
 
 
-def test_seeds_repeat_and_two_rooms_a_side_are_enough(rng):
-    a, b = rng.normal(size=(9, 4)), rng.normal(size=(6, 4))
-    one, two = (cross_validated_predictions(a, b, seed=3) for _ in range(2))
-    np.testing.assert_array_equal(one.right_generated, two.right_generated)
-    estimate = accuracy(cross_validated_predictions(a[:2], b[:2], seed=0))
-    assert estimate.value * 4 * REPEATS == pytest.approx(round(estimate.value * 4 * REPEATS))
-    same = np.ones((4, 3))
-    told = cross_validated_predictions(same, same, seed=0)
-    assert accuracy(told).value == 0.5  # identical pictures
-
-
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
     """A state dict of torchvision's names and shapes, with drawn numbers."""

@@ -13,7 +13,6 @@ from toy_metrics import Plain, fed
 from sceneprior.core.errors import InputError
 from sceneprior.evaluation.metrics.picture_distances import (
     frechet_distance,
-    gap_closed,
     in_manifold,
     kernel_distance,
     kernels,
@@ -45,16 +44,6 @@ def test_distances_refuse_too_few_images_and_broken_numbers():
         frechet_distance(np.zeros((1, 4)), np.zeros((3, 4)))
     with pytest.raises(InputError, match="not finite"):
         frechet_distance(np.zeros((2, 4)), np.full((3, 4), math.nan))
-
-
-def test_the_gap_closed_has_a_value_where_there_is_no_gap():
-    assert gap_closed(40.0, 60.0, 40.0) == 1 and gap_closed(60.0, 60.0, 40.0) == 0
-    assert gap_closed(55.0, 60.0, 40.0) == 0.25
-    assert gap_closed(70.0, 60.0, 40.0) == -0.5 and gap_closed(30.0, 60.0, 40.0) == 1.5
-    # Independent rooms as near as real ones, or nearer.
-    for independent in (40.0, 30.0):
-        assert gap_closed(40.0, independent, 40.0) == gap_closed(0.0, independent, 40.0) == 1
-        assert gap_closed(41.0, independent, 40.0) == 0
 
 
 def test_frechet_distance_is_torchmetrics(two_sets):

@@ -41,18 +41,6 @@ def nudged(scenes, metres) -> list[Scene]:
     return [replace(s, name="new", objects=tuple(map(moved, s.objects))) for s in scenes]
 
 
-def test_exact_copies_are_all_near_copies_and_real_rooms_are_none(training):
-    # Rooms that share no class: as far from each training room as can be.
-    test = [room(("stool", (0, 0, 0)), ("wardrobe", (1, 0, 0)))] * 4
-    comparison = compared(training, test)
-    copies = values(room_set(nudged(training, 0.0), training, training), comparison)
-    assert copies["near_copy_share"] == copies["near_copy_excess"] == 1
-    assert copies["nearest_training_m"] == copies["nearest_decoded_m"] == 0
-    real = values(room_set(training, training, own=True), comparison)
-    assert real["near_copy_share"] == real["near_copy_excess"] == 0
-    assert real["nearest_training_m"] > comparison.near_copy_m > 0
-
-
 def test_a_copy_of_what_the_prior_remembers_is_one_though_the_true_room_is_far(training):
     decoded = [replace(s, name=t.name) for s, t in zip(nudged(training, 5), training, strict=True)]
     comparison = compared(training, training[:2])

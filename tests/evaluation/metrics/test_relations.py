@@ -14,7 +14,6 @@ from sceneprior.evaluation.metrics.relations import (
     common_pairs,
     furthest_pairs,
     nearest_gaps,
-    pair_distances,
     wasserstein,
 )
 
@@ -67,26 +66,6 @@ def compared(test, real):
     return comparison
 
 
-def test_nightstands_that_stand_away_are_seen_and_by_how_much(rng):
-    real = [bedroom(gap) for gap in rng.uniform(0, 0.2, 40)]
-    test = [bedroom(gap) for gap in rng.uniform(0, 0.2, 40)]
-    comparison = compared(test, real)
-    apart = room_set([bedroom(gap) for gap in rng.uniform(1, 1.2, 40)], [])
-    distance = FUNCTIONS["relation_distance_m"](apart, comparison)
-    assert distance.value == pytest.approx(1.0, abs=0.05)
-    low, high = distance.interval()
-    assert low <= distance.value <= high and high - low < 0.1
-    floor = comparison.columns["train_rooms"]["relation_distance_m"].value
-    assert floor < 0.03
-    ratio = FUNCTIONS["relation_ratio"](apart, comparison)
-    assert ratio.value == pytest.approx(distance.value / floor)
-    rows = furthest_pairs(apart, room_set(real, []), comparison)
-    assert {(row["of"], row["to"]) for row in rows} == {
-        ("double_bed", "nightstand"), ("nightstand", "double_bed")
-    }  # fmt: skip
-    assert all((row["near"], row["near_test"]) == (0.0, 1.0) for row in rows)
-
-
 def test_common_pairs_weigh_more_and_the_table_begins_with_what_is_off_most():
     """Ten nightstands 1 m off and one chair 2 m off its desk: 20 gaps and 2."""
     desk = [("desk", (0, 0.5, 0)), ("chair", (1, 0.5, 0))]
@@ -98,25 +77,3 @@ def test_common_pairs_weigh_more_and_the_table_begins_with_what_is_off_most():
     pairs = [(row["of"], row["to"]) for row in furthest_pairs(off, room_set(real, []), comparison)]
     assert pairs[0] in (("nightstand", "double_bed"), ("double_bed", "nightstand"))
     assert len(pairs) == 4
-
-
-def test_a_set_without_a_pair_gets_no_better_by_it():
-    real = [bedroom(0.1)] * 20
-    comparison = compared(real, real)
-    lonely = room_set([of_classes("double_bed")] * 20, [])
-    assert FUNCTIONS["relation_distance_m"](lonely, comparison).value == pytest.approx(FAR_M - 0.1)
-    assert furthest_pairs(lonely, lonely, comparison)[0]["near"] is None
-    # A pair that the test rooms never have cannot be held against anything.
-    none = compared([of_classes("chair")] * 4, real)
-    assert pair_distances(lonely, none).pairs == []
-    assert FUNCTIONS["relation_distance_m"](lonely, none).value is None
-
-
-def test_resamples_without_any_pair_are_left_out():
-    real = [bedroom(0.1), of_classes("chair")]
-    comparison = compared(real, real)
-    # Of two rooms, a resample may hold the one without a pair twice.
-    few = room_set([bedroom(0.5), of_classes("chair")], [])
-    estimate = FUNCTIONS["relation_distance_m"](few, comparison)
-    assert estimate.value == pytest.approx(0.4)
-    assert np.isfinite(estimate.resamples).all() and 0 < len(estimate.resamples) < 20

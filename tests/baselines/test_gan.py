@@ -1,6 +1,6 @@
-"""Semantic maps: of what cameras saw, of decoded scenes, and what lies in front of what."""
+"""The GAN: semantic maps of cameras and of decoded scenes, its losses and its discriminator."""
 
-from dataclasses import replace
+import math
 from pathlib import Path
 
 import pytest
@@ -8,14 +8,24 @@ import torch
 import trimesh
 from torch.testing import assert_close
 
+from sceneprior.baselines.gan.losses import (
+    CEILING_M,
+    MARGIN_M,
+    SIZES_M,
+    VARIED,
+    adversarial_loss,
+    bounds_penalty,
+    diversity_loss,
+)
 from sceneprior.baselines.gan.semantic_maps import (
     POOLING,
     choices,
     compose_maps,
-    observed_counts,
     observed_maps,
     rendered_maps,
 )
+from sceneprior.baselines.gan.stage import GanStage
+from sceneprior.core.cameras import camera_centers
 from sceneprior.core.classes import VOID
 from sceneprior.core.dataset import ViewDataset
 from sceneprior.core.meshes import place
@@ -67,14 +77,6 @@ def test_observed_maps_are_the_shares_of_classes_in_each_pixel(views):
                     wanted[room, view, label, row // POOLING, column // POOLING] += 1 / POOLING**2
     assert torch.equal(maps, wanted)
     assert 0 < maps[:, :, VOID].mean() < 1
-
-
-def test_void_furniture_is_void_in_maps(views):
-    objects = views.is_object.sum(dim=1)[:, None, None, None]
-    hidden = replace(
-        views, instance_ids=torch.where(views.instance_ids == 0, objects + 1, views.instance_ids)
-    )
-    assert torch.equal(observed_maps(hidden, CLASSES), observed_maps(views, CLASSES))
 
 
 def test_the_true_room_looks_as_it_was_seen(views, toy_shards):
@@ -147,14 +149,84 @@ def test_choices_are_hard_and_their_gradients_soft(torch_rng):
     assert_close(got, wanted, rtol=0, atol=1e-15)
 
 
-def counts_of(scenes: DecodedScenes) -> torch.Tensor:
-    return torch.einsum("rk,rkc->rc", *choices(scenes))
+def scenes_of(boxes: torch.Tensor) -> DecodedScenes:
+    """Scenes with these centres and sizes; nothing else of them is asked for."""
+    return DecodedScenes(boxes, boxes[..., :3], boxes[..., 3:], boxes[..., 0], None, None)
 
 
-def test_counts_are_those_of_the_objects_that_exist(views, toy_shards):
-    assert torch.equal(counts_of(true_scenes(toy_shards, 4)), observed_counts(views, CLASSES))
-    for room, (shard, room_id) in zip(range(4), iterate_rooms(toy_shards, "train"), strict=False):
-        wanted = torch.zeros(CLASSES)
-        for label in shard.read_room(room_id).object_class:
-            wanted[int(label)] += 1
-        assert torch.equal(observed_counts(views, CLASSES)[room], wanted)
+def test_the_loss_is_cross_entropy(torch_rng):
+    patches = torch.randn(3, 2, 4, 5, generator=torch_rng, dtype=torch.float64)
+    rooms = torch.randn(3, generator=torch_rng, dtype=torch.float64)
+    for real in (True, False):
+        wanted = sum(
+            torch.nn.functional.binary_cross_entropy(
+                score.sigmoid(), torch.full_like(score, float(real))
+            )
+            for score in (patches, rooms)
+        )
+        assert_close(adversarial_loss((patches, rooms), real), wanted, rtol=0, atol=1e-12)
+
+
+def test_what_is_plausible_costs_nothing_and_what_is_not_is_drawn_back(toy_shards):
+    views = ViewDataset(toy_shards, "train", views_per_room=3, mask_step=4).__getitems__(
+        [(row, 0) for row in range(4)]
+    )
+    reach_x, _, reach_z = (
+        camera_centers(views.world_to_camera).abs().flatten(0, 1).max(dim=0).values + MARGIN_M
+    ).tolist()
+    fine = torch.tensor([0.0, 0.5, 0, 1, 1, 1]).repeat(4, 2, 1)
+    assert bounds_penalty(scenes_of(fine), views) == 0
+    entries = fine.numel() / 2 * 3  # of each kind: out of the room, too small, too large
+    for axis, value, cost in (
+        (0, -reach_x, 0.5),  # half of it is out
+        (2, reach_z + 3, 3.5),
+        (1, 0.2, 0.3),  # sunk into the floor
+        (1, CEILING_M, 0.5),
+        (4, SIZES_M[0] / 2, SIZES_M[0] / 2),
+        (5, SIZES_M[1] + 1, 1.0),
+    ):
+        boxes = fine.clone()
+        boxes[2, 1, axis] = value
+        boxes.requires_grad_()
+        told = bounds_penalty(scenes_of(boxes), views)
+        assert told.item() * entries == pytest.approx(cost, abs=1e-4)
+        told.backward()
+        pulled = boxes.grad[2, 1, axis] * math.copysign(1, value - float(fine[2, 1, axis]))
+        assert pulled > 0
+        assert not boxes.grad[:2].any()
+
+
+def test_sameness_is_minus_the_mean_log_spread_and_never_without_a_slope(torch_rng):
+    numbers = torch.randn(400, 2, 6, generator=torch_rng, dtype=torch.float64)
+    numbers = (numbers - numbers.mean(dim=0)) / numbers.std(dim=0, correction=0)
+    # That of y has no say, and those of z and height have no more to gain.
+    spreads = torch.tensor([0.5, 9, 3, 0.03, 1, 0.3]).double()
+    boxes = (numbers * spreads).requires_grad_()
+
+    assert_close(
+        diversity_loss(scenes_of(boxes)).item(),
+        -math.log(0.5 / VARIED[0] * 0.1) / 5,
+        rtol=0,
+        atol=1e-3,
+    )
+    one = torch.ones(3, 2, 6, requires_grad=True)
+    expected = -sum(math.log(1e-3 / wanted) for wanted in VARIED) / 5
+    assert diversity_loss(scenes_of(one)).item() == pytest.approx(expected, abs=1e-4)
+    diversity_loss(scenes_of(one)).backward()
+    assert one.grad.isfinite().all()
+
+
+@pytest.fixture
+def fresh(baseline_config):
+    """Makes an untrained module of a tiny run."""
+    return lambda **changes: GanStage(baseline_config("gan", **changes))
+
+
+def test_the_order_of_views_means_nothing_to_the_discriminator(fresh, toy_shards):
+    views = ViewDataset(toy_shards, "train", views_per_room=3, mask_step=4).__getitems__(
+        [(row, 0) for row in range(6)]
+    )
+    maps, judge = observed_maps(views, 22), fresh().discriminator.eval()
+    (patches, room), (patches_turned, room_turned) = judge(maps), judge(maps.flip(1))
+    assert_close(room_turned, room, rtol=0, atol=1e-5)
+    assert_close(patches_turned.flip(1), patches, rtol=0, atol=1e-5)

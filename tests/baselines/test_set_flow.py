@@ -5,13 +5,10 @@ from itertools import permutations
 
 import pytest
 import torch
-from tiny_runs import tiny_baseline
 from torch.testing import assert_close
 
 from sceneprior.baselines.set_flow import NUMBERS, SetFlow, SetFlowModel, matched
-from sceneprior.baselines.true_boxes import TruthDataset
 from sceneprior.core.views import RoomBoxes
-from sceneprior.training.steps import with_cosine
 
 CLASSES = 6
 
@@ -85,16 +82,6 @@ def test_tokens_become_the_rooms_again(network, rooms):
     assert network.counts.tolist() == [0, 0, 0, 1, 0, 1, 0, 0, 0, 0]
 
 
-def test_a_batch_of_empty_rooms_teaches_nothing(toy_shards):
-    stage = tiny_baseline(toy_shards, "set_flow").make()
-    dataset = TruthDataset(toy_shards, "train")
-    rooms = dataset.__getitems__([(0, -1), (1, -1)])
-    tokens = stage.prior.to_tokens(rooms)
-    numbers, logits = stage.prior.predict(tokens, torch.zeros(2), rooms.is_object)
-    (numbers.sum() + logits.sum()).backward()
-    assert all(value.grad is None or not value.grad.any() for value in stage.prior.parameters())
-
-
 def test_the_first_of_many_rooms_are_those_of_few(network):
     """In float64, where the last bits of another batch size are below 1e-10 on every processor."""
     rooms, few = network.sample(40, 3), network.sample(5, 3)
@@ -102,17 +89,6 @@ def test_the_first_of_many_rooms_are_those_of_few(network):
     assert_close(few.boxes_m, rooms.boxes_m[:5], rtol=0, atol=1e-10)
     assert_close(few.yaw_rad, rooms.yaw_rad[:5], rtol=0, atol=1e-10)
     assert not torch.equal(network.sample(5, 4).boxes_m, few.boxes_m)
-
-
-def test_rooms_have_as_many_objects_as_training_rooms(network):
-    rooms = network.float().sample(400, 0)
-    counts = rooms.is_object.sum(dim=1)
-    assert torch.equal(rooms.is_object, torch.arange(9) < counts[:, None])
-    share = torch.bincount(counts, minlength=10) / 400
-    assert_close(share, network.counts / network.counts.sum(), rtol=0, atol=0.08)
-    assert set(counts.tolist()) == {2, 3, 5, 9}
-    assert (rooms.object_class > 0).equal(rooms.is_object)
-    assert (rooms.boxes_m[rooms.is_object][:, 3:] > 0).all()
 
 
 def test_a_flow_that_knows_the_room_ends_in_it(network, rooms, monkeypatch):
@@ -139,33 +115,6 @@ def test_an_untrained_network_gives_the_best_linear_guess(network, batch):
     t = time[:, None, None]
     wanted = tokens[..., :NUMBERS] * (2 * t - 1) / (t**2 + (1 - t) ** 2) * is_object[..., None]
     assert_close(network.predict(*batch)[0], wanted, rtol=0, atol=1e-12)
-
-
-def test_a_set_flow_learns_rooms_by_heart(toy_shards):
-    """After training on three rooms, most drawn rooms hold exactly the furniture of one of them."""
-    model = {"max_objects": 6, "width": 64, "hidden": 128, "heads": 4, "layers": 2, "dropout": 0.0}
-    config = tiny_baseline(toy_shards, "set_flow", model=model | {"steps": 20})
-    dataset = TruthDataset(toy_shards, "train")
-    stage = config.build(dataset, None)
-    rooms = dataset.__getitems__([(row, 0) for row in [0, 1, 2] * 32])
-    stage.prior.fit_statistics(rooms)
-    built = with_cosine(torch.optim.Adam(stage.prior.parameters(), lr=3e-3), 400)
-    optimizer, schedule = built["optimizer"], built["lr_scheduler"]["scheduler"]
-    losses = []
-    stage.total = lambda losses, weights, batch: sum(losses.values())
-    for step in range(400):
-        optimizer.zero_grad()
-        loss = stage.training_step(rooms, step)
-        loss.backward()
-        optimizer.step()
-        schedule.step()
-        losses.append(loss.item())
-    assert sum(losses[-20:]) < 0.5 * sum(losses[:20])
-    found = stage.prior.eval().sample(60, 0)
-    known = dataset.__getitems__([(row, 0) for row in range(3)])
-    holds = [sorted(labels[labels > 0].tolist()) for labels in known.object_class]
-    drawn = [sorted(labels[labels > 0].tolist()) for labels in found.object_class]
-    assert sum(room in holds for room in drawn) > 30
 
 
 def test_noise_goes_the_shortest_way_to_the_objects(torch_rng):
