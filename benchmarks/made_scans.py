@@ -31,9 +31,8 @@ from data_prep.front.houses import house_files, read_house
 from data_prep.front.models import ModelBank
 from data_prep.front.recipe import Recipe, load_recipe
 from data_prep.readers.frames import Y_UP
-from data_prep.readers.nyu40 import LIKE_NYU40, NYU40
-from data_prep.readers.scannet.labels import Labels, read_labels
-from data_prep.readers.scannet.scans import ScanSettings, read_scan
+from data_prep.readers.labels import LIKE_NYU40, NYU40, Labels, read_labels
+from data_prep.readers.scanned_mesh import read_annotated_mesh
 from sceneprior.core.classes import STUFF, label_set
 
 sys.path.append(str(Path(__file__).parents[1] / "tests" / "data_prep" / "scannet"))
@@ -154,16 +153,24 @@ def scanned(room: Room, folder: Path, seed: int) -> MadeScan:
 def overlaps(scan: MadeScan, labels: Labels) -> dict[str, list[float]]:
     """3D IoU of the boxes that `prep-scannet` reads with the true ones, by class; 0 for an object
     that no frame saw."""
-    read = read_scan(scan.folder, labels, ScanSettings(frame_step=1))
-    to_room = read.room_from_scan @ np.linalg.inv(scan.alignment)
-    found = {item.object_id: item for item in read.instances}
+    read = read_annotated_mesh(
+        scan.path("_vh_clean_2.ply"),
+        scan.path("_vh_clean_2.0.010000.segs.json"),
+        scan.path(".aggregation.json"),
+        scan.alignment,
+    )
+    found = {
+        group.object_id: read.points_m(k)
+        for k, group in enumerate(read.groups)
+        if len(read.parts[k])
+    }
     scores: dict[str, list[float]] = defaultdict(list)
     for k, box in enumerate(scan.boxes):
         if labels.is_shell(box.category):
             continue
-        corners = box.corners @ to_room[:3, :3].T + to_room[:3, 3]
-        lower, upper = corners.min(axis=0), corners.max(axis=0)
-        low, high = (found[k].lower_m, found[k].upper_m) if k in found else np.zeros((2, 3))
+        lower, upper = box.corners.min(axis=0), box.corners.max(axis=0)
+        points = found.get(k, np.zeros((1, 3)))
+        low, high = points.min(axis=0), points.max(axis=0)
         shared = np.clip(np.minimum(upper, high) - np.maximum(lower, low), 0, None).prod()
         both = (upper - lower).prod() + (high - low).prod() - shared
         scores[labels.label(box.category)].append(float(shared / both))

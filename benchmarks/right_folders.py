@@ -27,8 +27,7 @@ from data_prep.homes.make import make_homes
 from data_prep.inspection.causes import GIVEN
 from data_prep.inspection.diagnosis import what_was_checked
 from data_prep.inspection.verify import verify
-from data_prep.readers.posed.source import PosedSource
-from data_prep.readers.posed.views import PosedSettings
+from data_prep.readers.posed.reader import Posed
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.shards import RoomViews, iterate_rooms, read_index
@@ -190,8 +189,9 @@ def make_shards(drawn: Draw, seed: int, homes: Path, out: Path) -> None:
     ]  # fmt: skip
     for place, views in enumerate(rooms[: drawn.rooms]):
         capture(views, names, drawn, 100 * seed + place, captures / f"room{place}")
-    settings = PosedSettings(tracks="auto" if drawn.auto else "given")
-    build_shards(Job(PosedSource(captures, recipe.label_set, settings), out / "shards"))
+    tracks = "auto" if drawn.auto else "given"
+    reader = Posed(captures, classes=recipe.label_set, tracks=tracks)
+    build_shards(Job(reader, out / "shards"))
     for folder in (houses, front, captures):
         shutil.rmtree(folder)
 

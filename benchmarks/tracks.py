@@ -18,7 +18,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 
-from data_prep.readers.posed.corrected import correct
+from data_prep.readers.corrected import correct
 from data_prep.tracks.associate import FrameMasks, Tracks, associate
 from sceneprior.core.classes import VOID
 from sceneprior.core.observations import observe

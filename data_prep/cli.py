@@ -137,12 +137,13 @@ def prep_scannet(
 
     Exit status: 0, or 3 if scans failed (the others are prepared; report.csv says why).
     """
-    from data_prep.readers.scannet.scans import FULL_SIZE, QUARTER_SIZE, ScanSettings
-    from data_prep.readers.scannet.source import ScanNetSource
+    from data_prep.readers.scannet import FULL_SIZE, QUARTER_SIZE, ScanNet
 
-    size = FULL_SIZE if full_size else QUARTER_SIZE
-    settings = ScanSettings(frame_step, max_views, masks, size)
-    source = ScanNetSource(scans, labels, settings, train_list, val_list, seed, only)
+    source = ScanNet(
+        scans, labels=labels, frame_step=frame_step, max_views=max_views, masks=masks,
+        image_size=FULL_SIZE if full_size else QUARTER_SIZE, train=train_list, val=val_list,
+        seed=seed, only=only,
+    )  # fmt: skip
     run_job(source, out, workers, retry_failed)
 
 
@@ -203,17 +204,15 @@ def prep_posed(
 
     Exit status: 0, or 3 if rooms failed (the others are prepared; report.csv says why).
     """
-    from data_prep.readers.posed.formats import read_formats
-    from data_prep.readers.posed.labels import read_label_set
-    from data_prep.readers.posed.source import PosedSource
-    from data_prep.readers.posed.views import PosedSettings
+    from data_prep.readers.posed.formats import read_formats, read_label_set
+    from data_prep.readers.posed.reader import Posed
 
-    settings = PosedSettings(
-        up, floor_m, camera_height_m, metres_per_unit, max_side, tracks, max_views
-    )
-    classes = read_label_set(label_set)
-    formats = read_formats(tools or ())
-    source = PosedSource(rooms, classes, settings, test_share, seed, only, formats)
+    source = Posed(
+        rooms, classes=read_label_set(label_set), formats=read_formats(tools or ()), up=up,
+        floor_m=floor_m, camera_height_m=camera_height_m, metres_per_unit=metres_per_unit,
+        max_side=max_side, tracks=tracks, max_views=max_views, test_share=test_share, seed=seed,
+        only=only,
+    )  # fmt: skip
     for sentence in source.found():
         typer.echo(f"Found {sentence}", err=True)
     for sentence in source.assumptions():
@@ -252,10 +251,12 @@ def prep_dataset(
 
     Exit status: 0, or 3 if rooms failed (the others are prepared; report.csv says why).
     """
-    from data_prep.readers.source import PublicSource, open_reader
+    from data_prep.readers import open_reader
 
-    reader = open_reader(name, folder, recipe)
-    source = PublicSource(reader, splits, max_side, max_views, seed, only)
+    source = open_reader(
+        name, folder, recipe, splits=splits, max_side=max_side, max_views=max_views, seed=seed,
+        only=only,
+    )  # fmt: skip
     run_job(source, out, workers, retry_failed)
 
 

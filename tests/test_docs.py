@@ -27,7 +27,7 @@ from sceneprior.core.scene_json import read_scene
 
 LONGEST_LINE = 110
 
-RUN_ELSEWHERE = {("docs/posed_data.md", "python"): "tests/data_prep/posed/test_docs.py"}
+RUN_ELSEWHERE = {("docs/posed_data.md", "python"): "tests/data_prep/readers/test_posed_docs.py"}
 """Blocks that another test executes, because they need more than toy shards."""
 BASES = [
     ROOT / name for name in ("", "sceneprior", "docs", "configs", "benchmarks", "data_prep/engine")

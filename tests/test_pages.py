@@ -45,8 +45,8 @@ RUN_HERE = [
     "docs/captures.md",
 ]  # fmt: skip
 WHOLE_PAGES = {
-    "docs/posed_data.md": "tests/data_prep/posed/test_docs.py",
-    "docs/public_data.md": "tests/data_prep/public/test_data_sets.py",
+    "docs/posed_data.md": "tests/data_prep/readers/test_posed_docs.py",
+    "docs/public_data.md": "tests/data_prep/readers/test_data_sets.py",
     "docs/own_room_types.md": "tests/data_prep/front/test_own_room_types.py",
 }
 """Guides that tests of their own run as printed, on data of their own."""

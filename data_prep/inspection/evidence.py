@@ -13,8 +13,7 @@ from scipy.stats import rankdata
 from data_prep.inspection.agreement import NEAR_M, Room
 from data_prep.inspection.camera_convention import Convention
 from data_prep.inspection.causes import Cause, corrections
-from data_prep.readers.posed.floor import find_floor
-from data_prep.readers.upright import own_sides
+from data_prep.readers.upright import find_floor, own_sides
 from sceneprior.core.cameras import camera_centers
 from sceneprior.core.shards import RoomViews
 

@@ -12,7 +12,6 @@ Source: BlenderProc's Front3DLoader, SegMapRendererUtility and WriterUtility; th
 render_dataset_improved_mat.py (BlenderProc-3DFront) and 1_process_viewdata.py (ScenePriors).
 """
 
-import csv
 import json
 from collections import Counter
 from dataclasses import dataclass
@@ -25,9 +24,10 @@ from pydantic import BaseModel, Field, TypeAdapter
 from data_prep.engine.plan import digest
 from data_prep.engine.source import RoomTask
 from data_prep.front.recipe import Recipe
-from data_prep.readers.files import read_hdf5
-from data_prep.readers.frames import GL_TO_CV
-from data_prep.readers.rooms import FoundRoom, FramedRoom, Reader, chosen_frames, sampled
+from data_prep.readers.files import by_number, read_hdf5, read_records
+from data_prep.readers.frames import GL_TO_CV, chosen_frames, sampled
+from data_prep.readers.reader import FoundRoom, Reader
+from data_prep.readers.rooms import FramedRoom, numbered
 from sceneprior.core.checked import plain, shown
 from sceneprior.core.errors import InputError
 from sceneprior.core.furniture import INFO_FILES, model_categories, tidy_category
@@ -56,7 +56,7 @@ class _Part(BaseModel):
 _PARTS = TypeAdapter(list[_Part])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class BlenderProc(Reader):
     """BlenderProc's frames; a house is a scene with several rooms."""
 
@@ -72,10 +72,11 @@ class BlenderProc(Reader):
     def room_type(self) -> str:
         return self.recipe.name
 
-    def settings(self) -> dict[str, Any]:
-        """See `Reader.settings`."""
+    def options(self) -> dict[str, Any]:
+        """See `Reader.options`."""
         models = sorted(_categories(self.folder).items(), key=repr)
         return {
+            **super().options(),
             **self.recipe.model_dump(include={"name", "label_set", "categories", "room_types"}),
             "models": digest(repr(models)),
             "intrinsics": _intrinsics(self.folder).tolist(),
@@ -89,8 +90,7 @@ class BlenderProc(Reader):
         """Rooms of the recipe's types; a frame belongs to the room with most furniture pixels."""
         frames: dict[str, list[str]] = {}
         size = (0, 0)
-        paths = (self.folder / scene).glob("*.hdf5")
-        for path in sorted(paths, key=lambda path: (len(path.name), path.name)):
+        for path in by_number([*(self.folder / scene).glob("*.hdf5")]):
             image, parts = _read_frame(path)
             if size not in ((0, 0), image.shape):
                 raise InputError(
@@ -111,11 +111,11 @@ class BlenderProc(Reader):
             if self.recipe.of_type(room.partition("-")[0])
         }
 
-    def read(self, task: RoomTask, max_side: int | None, max_views: int) -> FramedRoom:
+    def read(self, task: RoomTask) -> FramedRoom:
         """Read the frames of one room; other rooms' furniture, behind doors, is unknown."""
         paths = [self.folder / task.house / name for name in task.extra["frames"]]
         poses = np.stack([_read_pose(path) for path in paths])
-        choice = chosen_frames(task.room_id, poses, list(range(len(paths))), max_views)
+        choice = chosen_frames(task.room_id, poses, range(len(paths)), self.max_views)
         categories = _categories(self.folder)
         numbers: dict[str, int] = {}
         classes: dict[int, str] = {}
@@ -134,14 +134,18 @@ class BlenderProc(Reader):
                 classes[number] = self.recipe.class_of(category)
             K = _MIRROR[:3, :3] @ _intrinsics(self.folder) @ _MIRROR[:3, :3]
             K[0, 2] += image.shape[1]
-            lines, K = sampled(image.shape, max_side, K)
+            lines, K = sampled(image.shape, self.max_side, K)
             images.append(table[image[:, ::-1]][lines])
             intrinsics.append(K)
         mirrored = _FROM_BLENDER @ poses[list(choice.frames)] @ _MIRROR @ GL_TO_CV
+        notes = tuple(choice.notes("image of ids"))
+        ids = np.stack(images)
         return FramedRoom(
-            np.stack(images), classes, mirrored, np.stack(intrinsics), floor_y=0.0,
-            notes=tuple(choice.notes("image of ids")),
-        )  # fmt: skip
+            **numbered(ids, classes, self.label_set, task.room_id, notes=notes),
+            camera_to_world=mirrored,
+            intrinsics=np.stack(intrinsics),
+            floor_y=0.0,
+        )
 
 
 def _read_frame(path: Path) -> tuple[np.ndarray, list[_Part]]:
@@ -197,16 +201,15 @@ def _categories(folder: Path) -> dict[Any, str]:
     if any((folder / name).is_file() for name in INFO_FILES):
         return dict(model_categories(folder))
     path = folder / LABELS
-    try:
-        with path.open(encoding="utf-8", newline="") as file:
-            return {int(row["id"]): tidy_category(row["name"]) for row in csv.DictReader(file)}
-    except FileNotFoundError:
+    if not path.is_file():
         raise InputError(
             f"{folder} has neither 3D-FUTURE's {INFO_FILES[0]} nor BlenderProc's {LABELS} "
             "(resources/front_3D), which say what each piece is; copy one of them there."
-        ) from None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, csv.Error) as error:
-        raise InputError(
-            f"{path} is not BlenderProc's table of the columns id and name "
-            f"({type(error).__name__}: {plain(str(error), 120)})."
-        ) from None
+        )
+    what = "BlenderProc's table of the columns id and name"
+    rows = read_records(path, f"it is {what}")
+    try:
+        return {int(row["id"]): tidy_category(row["name"]) for row in rows}
+    except (ValueError, KeyError) as error:
+        reason = f"{type(error).__name__}: {plain(str(error), 120)}"
+        raise InputError(f"{path} is not {what} ({reason}).") from None

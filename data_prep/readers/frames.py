@@ -1,10 +1,11 @@
 """Chooses the frames of a recording that become views, and computes their cameras."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from sceneprior.core.checked import shown
 from sceneprior.core.errors import InputError
 
 _ROTATION_SLACK = 1e-2
@@ -73,6 +74,37 @@ def choose_frames(
     )
 
 
+def chosen_frames(
+    where: str,
+    camera_to_world: np.ndarray,
+    with_mask: Collection[int],
+    at_most: int,
+    step: int = 1,
+    mask: str = "image of ids",
+    names: Sequence[str] | None = None,
+    hint: str = " Download it again.",
+) -> FrameChoice:
+    """Choose frames (`choose_frames`); an `InputError` if none is usable.
+
+    The message begins with `where` and ends with `hint`; `mask` is the name of a missing mask, and
+    `names` are those of the frames, if they have other names than their numbers.
+    """
+    choice = choose_frames(camera_to_world, with_mask, step, at_most)
+    if choice.frames:
+        return choice
+    bad = np.flatnonzero(~is_pose(camera_to_world[::step])) * step
+    fault = ""
+    if len(bad):
+        frame = bad[0] if names is None else shown(names[bad[0]])
+        fault = f"; frame {frame}: {pose_fault(camera_to_world[bad[0]])}"
+    every = f" (every {step})" if step > 1 else ""
+    raise InputError(
+        f"{where} has no usable frame: {choice.bad_poses} of {choice.candidates}{every} have no "
+        f"usable pose (a rotation with a translation), {choice.without_mask} no {mask}{fault}."
+        f"{hint}"
+    )
+
+
 def is_pose(camera_to_world: np.ndarray) -> np.ndarray:
     """Test which (4, 4) matrices are rigid transforms with finite, plausible entries: (frames,)."""
     with np.errstate(invalid="ignore"):  # some bit patterns of NaN
@@ -84,12 +116,6 @@ def is_pose(camera_to_world: np.ndarray) -> np.ndarray:
     bottom = np.abs(safe[:, 3] - (0, 0, 0, 1)).max(axis=1)
     right_handed = np.linalg.det(turn) > 0
     return finite & (off < _ROTATION_SLACK) & (bottom < _ROTATION_SLACK) & right_handed
-
-
-def first_fault(camera_to_world: np.ndarray, step: int = 1) -> tuple[int, str] | None:
-    """Number and fault of the first of every `step`-th pose that `is_pose` rejects."""
-    bad = np.flatnonzero(~is_pose(camera_to_world[::step])) * step
-    return (int(bad[0]), pose_fault(camera_to_world[bad[0]])) if len(bad) else None
 
 
 def pose_fault(camera_to_world: np.ndarray) -> str:
@@ -119,12 +145,17 @@ def pose_fault(camera_to_world: np.ndarray) -> str:
     return "its axes are no rotation"
 
 
-def room_cameras(camera_to_world: np.ndarray, room_from_scan: np.ndarray) -> np.ndarray:
+def room_cameras(
+    camera_to_world: np.ndarray, room_from_world: np.ndarray | None = None
+) -> np.ndarray:
     """World-to-camera transforms in the room frame, float64, of good poses with OpenCV axes.
 
     The rotation is the nearest exact one, so that a camera's centre and its rays agree to rounding.
+    Without `room_from_world`, the room frame is the world.
     """
-    poses = np.asarray(room_from_scan, dtype=np.float64) @ camera_to_world.astype(np.float64)
+    poses = camera_to_world.astype(np.float64)
+    if room_from_world is not None:
+        poses = np.asarray(room_from_world, dtype=np.float64) @ poses
     u, _, v = np.linalg.svd(poses[:, :3, :3])
     turn = (u @ v).transpose(0, 2, 1)
     inverse = np.zeros_like(poses)
@@ -199,3 +230,12 @@ def mask_intrinsics(
         intrinsics[axis, 2] -= late
         intrinsics[axis] /= step
     return intrinsics
+
+
+def sampled(
+    size: tuple[int, int], max_side: int | None, intrinsics: np.ndarray
+) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
+    """Index that shrinks an image of this (height, width), and the intrinsics of the result."""
+    stored = shrunk(size, max_side)
+    lines = np.ix_(*(sampled_lines(*sides) for sides in zip(size, stored, strict=True)))
+    return lines, mask_intrinsics(intrinsics, size, size, stored)

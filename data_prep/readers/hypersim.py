@@ -13,27 +13,20 @@ Source: the README, scene_generate_images_bounding_box.py and contrib/mikerobert
 apple/ml-hypersim.
 """
 
-import csv
 import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+from scipy.linalg import rq
 
 from data_prep.engine.source import RoomTask
-from data_prep.readers.files import read_hdf5
-from data_prep.readers.frames import GL_TO_CV, Y_UP
-from data_prep.readers.nyu40 import ids_and_classes
-from data_prep.readers.rooms import (
-    FoundRoom,
-    FramedRoom,
-    Reader,
-    chosen_frames,
-    corners_of,
-    sampled,
-)
-from data_prep.readers.tilt import pinhole, straight_grid
+from data_prep.readers.files import read_hdf5, read_records
+from data_prep.readers.frames import GL_TO_CV, Y_UP, chosen_frames, sampled
+from data_prep.readers.labels import ids_and_classes
+from data_prep.readers.reader import FoundRoom, Reader
+from data_prep.readers.rooms import FramedRoom, corners_of, numbered
 from sceneprior.core.checked import plain
 from sceneprior.core.errors import InputError
 
@@ -42,16 +35,16 @@ _BOXES = "metadata_semantic_instance_bounding_box_object_aligned_2d_{}.hdf5"
 _HINT = "download the scene again"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Hypersim(Reader):
     """Hypersim's scenes."""
 
     name: ClassVar = "hypersim"
 
-    def settings(self) -> dict[str, Any]:
-        """See `Reader.settings`."""
+    def options(self) -> dict[str, Any]:
+        """See `Reader.options`."""
         _camera_rows(self.folder / CAMERAS)
-        return {}
+        return super().options()
 
     def scenes(self) -> list[str]:
         """See `Reader.scenes`."""
@@ -66,7 +59,7 @@ class Hypersim(Reader):
         row = _camera_row(self.folder / CAMERAS, scene)
         return {scene: FoundRoom(_image_size(row))}
 
-    def read(self, task: RoomTask, max_side: int | None, max_views: int) -> FramedRoom:
+    def read(self, task: RoomTask) -> FramedRoom:
         """See `Reader.read`."""
         scene = self.folder / task.house
         row = _camera_row(self.folder / CAMERAS, task.house)
@@ -75,10 +68,10 @@ class Hypersim(Reader):
         unit = _metres_per_unit(scene / "_detail" / "metadata_scene.csv")
         images, poses = _trajectories(scene, unit)
         with_ids = [k for k, paths in enumerate(images) if all(path.is_file() for path in paths)]
-        choice = chosen_frames(str(scene), poses, with_ids, max_views)
-        lines, inside = straight_grid(sampled(size, max_side, intrinsics)[0], intrinsics, size)
+        choice = chosen_frames(str(scene), poses, with_ids, self.max_views)
+        lines, inside = straight_grid(sampled(size, self.max_side, intrinsics)[0], intrinsics, size)
         intrinsics[0, 1] = 0
-        intrinsics = sampled(size, max_side, intrinsics)[1]
+        intrinsics = sampled(size, self.max_side, intrinsics)[1]
         arrays = [
             [np.where(inside, _image(path, size)[lines], -1) for path in images[k]]
             for k in choice.frames
@@ -89,10 +82,12 @@ class Hypersim(Reader):
         cameras = Y_UP @ poses[list(choice.frames)] @ GL_TO_CV
         cameras[:, :3, :3] = cameras[:, :3, :3] @ tilt.T
         boxes = _boxes(scene / "_detail" / "mesh", unit)
+        notes = tuple(choice.notes("image of ids"))
         return FramedRoom(
-            ids, classes, cameras, intrinsics, boxes, stuff=stuff,
-            notes=tuple(choice.notes("image of ids")),
-        )  # fmt: skip
+            **numbered(ids, classes, self.label_set, task.room_id, boxes, stuff, notes),
+            camera_to_world=cameras,
+            intrinsics=intrinsics,
+        )
 
 
 def _camera_rows(path: Path) -> dict[str, dict[str, str]]:
@@ -102,7 +97,7 @@ def _camera_rows(path: Path) -> dict[str, dict[str, str]]:
             f"{path} is missing: the projection of each scene. Copy it from "
             "contrib/mikeroberts3000 of Hypersim's code (github.com/apple/ml-hypersim)."
         )
-    rows = _csv_rows(path)
+    rows = read_records(path, _HINT)
     if not rows or not {"scene_name", "M_cam_from_uv_00"} <= set(rows[0]):
         raise InputError(
             f"{path} has no columns scene_name and M_cam_from_uv_00 to _22; copy it again from "
@@ -116,14 +111,6 @@ def _camera_row(path: Path, scene: str) -> dict[str, str]:
     if scene not in rows:
         raise InputError(f"{path} has no row for {plain(scene)}.")
     return rows[scene]
-
-
-def _csv_rows(path: Path) -> list[dict[str, str]]:
-    try:
-        with path.open(encoding="utf-8", newline="") as file:
-            return list(csv.DictReader(file))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path} cannot be read ({plain(str(error), 120)}); {_HINT}.") from None
 
 
 def _numbers(row: dict[str, str], names: list[str], where: str) -> np.ndarray:
@@ -152,7 +139,7 @@ def _cam_from_uv(row: dict[str, str]) -> np.ndarray:
 
 
 def _metres_per_unit(path: Path) -> float:
-    rows = {row.get("parameter_name"): row for row in _csv_rows(path)}
+    rows = {row.get("parameter_name"): row for row in read_records(path, _HINT)}
     row = rows.get("meters_per_asset_unit", {})
     (value,) = _numbers(row, ["parameter_value"], f"{path}, meters_per_asset_unit,")
     if value <= 0:
@@ -213,3 +200,51 @@ def _boxes(folder: Path, unit: float) -> dict[int, np.ndarray]:
         for k, (center, columns, half) in enumerate(rows)
         if np.isfinite([*center, *columns.ravel(), *half]).all() and (half > 0).all()
     }
+
+
+def pinhole(cam_from_uv: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Split a projection of Hypersim into intrinsics, with skew, and a rotation of the camera.
+
+    `cam_from_uv` (3, 3) maps (u, v, 1), both in [-1, 1] with v upwards, to a ray in OpenGL's camera
+    axes. A camera with a tilted image plane equals a rotated pinhole camera, since any invertible
+    matrix is an upper triangular matrix times a rotation.
+
+    Returns:
+        Intrinsics, (3, 3), pixel centres at i + 0.5; and the rotation, (3, 3), from OpenCV's axes
+        of the scene's camera to those of the pinhole.
+
+    Example: no tilt, 90 degrees wide.
+
+        >>> intrinsics, tilt = pinhole(np.diag([1.0, 0.75, -1.0]), (768, 1024))
+        >>> intrinsics.round(6).tolist()
+        [[512.0, 0.0, 512.0], [0.0, 512.0, 384.0], [0.0, 0.0, 1.0]]
+    """
+    height, width = size
+    uv_from_pixel = np.array([[2 / width, 0, -1], [0, -2 / height, 1], [0, 0, 1.0]])
+    pixel_from_ray = np.linalg.inv(GL_TO_CV[:3, :3] @ cam_from_uv @ uv_from_pixel)
+    intrinsics, turn = rq(pixel_from_ray)
+    signs = np.diag(np.sign(np.diag(intrinsics)))
+    intrinsics, turn = intrinsics @ signs, signs @ turn
+    return intrinsics / intrinsics[2, 2], turn
+
+
+def straight_grid(
+    lines: tuple[np.ndarray, ...], intrinsics: np.ndarray, size: tuple[int, int]
+) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+    """Remove the skew of `intrinsics` by shifting the rows of an image.
+
+    An image plane that is tilted about both axes has a skewed pixel grid, which shards cannot
+    store: u = fx * x / z + skew * y / z + cx. Within its row, each pixel takes the value of the
+    pixel to which the skew moves it.
+
+    Args:
+        lines: Rows (h, 1) and columns (1, w) of an image of `size`, (height, width).
+
+    Returns:
+        Rows and columns to read, (h, w); and True for the pixels within the image, (h, w).
+    """
+    rows, columns = lines
+    shift = intrinsics[0, 1] * (rows + 0.5 - intrinsics[1, 2]) / intrinsics[1, 1]
+    columns = np.floor(columns + 0.5 + shift).astype(np.int64)
+    inside = (columns >= 0) & (columns < size[1])
+    return (np.broadcast_to(rows, columns.shape), columns.clip(0, size[1] - 1)), inside

@@ -14,6 +14,7 @@ Source: common/scene_release.py, common/utils/anno.py, semantic/transforms/mesh.
 iphone/arkit_pcl.py of scannetpp/scannetpp; its issue 160, and nerfstudio's colmap_to_json.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -23,28 +24,20 @@ from pydantic import BaseModel, Field, RootModel
 
 from data_prep.engine.plan import digest
 from data_prep.engine.source import RoomTask
-from data_prep.readers.frames import GL_TO_CV, Y_UP, shrunk
-from data_prep.readers.nyu40 import LIKE_NYU40
+from data_prep.readers.frames import GL_TO_CV, Y_UP, chosen_frames, shrunk
+from data_prep.readers.labels import LABEL_SET, LIKE_NYU40, TABLE, Labels, read_labels
 from data_prep.readers.posed.colmap import read_model
-from data_prep.readers.posed.recording import Camera, PosedFrame, frame_intrinsics
+from data_prep.readers.posed.recording import PosedFrame, PosedPicture, frame_intrinsics
 from data_prep.readers.posed.transforms import FILE_NAME, read_recording
-from data_prep.readers.rooms import FoundRoom, FramedRoom, Reader, chosen_frames
-from data_prep.readers.scannet.annotations import (
-    Group,
-    object_parts,
-    read_groups,
-    read_mesh,
-    read_segments,
-)
-from data_prep.readers.scannet.labels import LABEL_SET, Labels, read_labels
+from data_prep.readers.reader import FoundRoom, Reader
+from data_prep.readers.rooms import FramedRoom, numbered
+from data_prep.readers.scanned_mesh import AnnotatedMesh, focal_and_center, read_annotated_mesh
 from sceneprior.core.checked import checked
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
-from sceneprior.core.scene import Mesh
 from sceneprior.render.zbuffer import rasterize
 
-TABLE = "scannetv2-labels.combined.tsv"
 _IPHONE = "iphone/pose_intrinsic_imu.json"
 _IPHONE_SIZE = (1440, 1920)
 """(height, width) of the iPhone's pictures, which its file does not state."""
@@ -63,15 +56,16 @@ class _Frames(RootModel[dict[str, _Frame]]):
     pass
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ScanNetPP(Reader):
     """ScanNet++; a scene is a room."""
 
     name: ClassVar = "scannetpp"
 
-    def settings(self) -> dict[str, Any]:
-        """See `Reader.settings`."""
-        return {"labels": digest(repr(sorted(_labels(self.folder).nyu40.items())))}
+    def options(self) -> dict[str, Any]:
+        """See `Reader.options`."""
+        labels = digest(repr(sorted(_labels(self.folder).nyu40.items())))
+        return {**super().options(), "labels": labels}
 
     def scenes(self) -> list[str]:
         """See `Reader.scenes`."""
@@ -82,55 +76,57 @@ class ScanNetPP(Reader):
         _, _, size = _cameras(self.folder / scene)
         return {scene: FoundRoom(size)}
 
-    def read(self, task: RoomTask, max_side: int | None, max_views: int) -> FramedRoom:
+    def read(self, task: RoomTask) -> FramedRoom:
         """Draw the ids of all views; unannotated surfaces, and holes of the mesh, are unknown."""
         scene = self.folder / task.house
         poses, intrinsics, size = _cameras(scene)
-        choice = chosen_frames(str(scene), poses, list(range(len(poses))), max_views)
+        choice = chosen_frames(str(scene), poses, range(len(poses)), self.max_views)
         frames = list(choice.frames)
-        path = scene / _MESH
-        mesh = read_mesh(path)
-        mesh = Mesh(mesh.vertices_m @ Y_UP[:3, :3].T, mesh.faces)
-        cameras = Y_UP @ poses[frames]
+        scan = read_annotated_mesh(
+            scene / _MESH,
+            scene / "scans/segments.json",
+            scene / "scans/segments_anno.json",
+            Y_UP,
+        )
+        cameras, mesh = Y_UP @ poses[frames], scan.mesh
         low, high = mesh.vertices_m.min(axis=0), mesh.vertices_m.max(axis=0)
         eyes = cameras[:, :3, 3]
         outside = ((eyes < low - _OUTSIDE_M) | (eyes > high + _OUTSIDE_M)).any(axis=1)
         if outside.any():
             raise InputError(
                 f"{scene}: {outside.sum()} of {len(frames)} cameras are more than "
-                f"{_OUTSIDE_M:g} m outside of {path.name}; poses and mesh are not of one release, "
-                "or the poses have another convention. Download both again."
+                f"{_OUTSIDE_M:g} m outside of {Path(_MESH).name}; poses and mesh are not of one "
+                "release, or the poses have another convention. Download both again."
             )
-        groups, notes = read_groups(scene / "scans/segments_anno.json")
-        segments = read_segments(scene / "scans/segments.json")
-        if len(segments) != len(mesh.vertices_m):
-            raise InputError(
-                f"{scene}: segments.json has {len(segments)} segIndices, but {path.name} "
-                f"{len(mesh.vertices_m)} vertices; they are not of one release, or the mesh is "
-                "truncated. Download both again."
-            )
-        parts = object_parts(groups, segments)
         labels = _labels(self.folder)
-        vertex_ids, vertex_stuff, classes = _ids(groups, parts, labels, len(mesh.vertices_m))
-        stored = shrunk(size, max_side)
+        vertex_ids, vertex_stuff, classes = _ids(scan, labels)
+        stored = shrunk(size, self.max_side)
         scale = np.array([stored[1] / size[1], stored[0] / size[0], 1.0])
         lenses = intrinsics[frames] * scale[:, None]
-        faces = [
-            _nearest_faces(mesh, camera, K, stored)
-            for camera, K in zip(np.linalg.inv(cameras), lenses, strict=True)
-        ]
+        faces = np.stack(
+            [
+                rasterize(mesh.vertices_m, mesh.faces, camera, focal_and_center(K), stored)[0]
+                for camera, K in zip(np.linalg.inv(cameras), lenses, strict=True)
+            ]
+        )
         # The last entry is for pixels without a face.
-        ids = np.append(_most_common(vertex_ids[mesh.faces]), np.int32(-1))[np.stack(faces)]
-        stuff = np.append(_most_common(vertex_stuff[mesh.faces]), np.uint8(0))[np.stack(faces)]
-        points = {k + 1: mesh.vertices_m[part] for k, part in enumerate(parts) if len(part)}
-        floors = [part for group, part in zip(groups, parts, strict=True)
-                  if labels.nyu40.get(group.category.strip().lower()) == "floor"]  # fmt: skip
-        heights = mesh.vertices_m[np.concatenate(floors), 1] if floors else np.zeros(0)
+        ids = np.append(_most_common(vertex_ids[mesh.faces]), np.int32(-1))[faces]
+        stuff = np.append(_most_common(vertex_stuff[mesh.faces]), np.uint8(0))[faces]
+        points = {k + 1: scan.points_m(k) for k, part in enumerate(scan.parts) if len(part)}
+        floors = [
+            scan.points_m(k)[:, 1]
+            for k, group in enumerate(scan.groups)
+            if labels.nyu40_class(group.category) == "floor"
+        ]
+        heights = np.concatenate([np.zeros(0), *floors])
+        notes = (*scan.notes, *choice.notes("image of ids"))
         return FramedRoom(
-            ids, classes, cameras, lenses, points, stuff=stuff,
+            **numbered(ids, classes, self.label_set, task.room_id, points, stuff, notes),
+            camera_to_world=cameras,
+            intrinsics=lenses,
             floor_y=float(np.median(heights)) if len(heights) else None,
-            ceiling_y=float(high[1]), notes=(*notes, *choice.notes("image of ids")),
-        )  # fmt: skip
+            ceiling_y=float(high[1]),
+        )
 
 
 def _cameras(scene: Path) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
@@ -140,12 +136,10 @@ def _cameras(scene: Path) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
         model = [scene / device / "colmap" / f"{name}.txt" for name in ("cameras", "images")]
         poses_path = scene / device / "nerfstudio" / FILE_NAME
         if all(path.is_file() for path in model):
-            images = [(image.camera_to_world, image.camera) for image in read_model(*model)]
-            return _in_mesh(model[1], np.eye(4), images)
+            return _in_mesh(model[1], np.eye(4), read_model(*model))
         if poses_path.is_file():
             frames = read_recording(poses_path.parent).frames
-            images = [(frame.camera_to_world, frame.camera.model_dump()) for frame in frames]
-            return _in_mesh(poses_path, _FROM_NERFSTUDIO, images)
+            return _in_mesh(poses_path, _FROM_NERFSTUDIO, frames)
     path = scene / _IPHONE
     if not path.is_file():
         raise InputError(
@@ -165,23 +159,17 @@ def _cameras(scene: Path) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
 
 
 def _in_mesh(
-    path: Path, mesh_from_world: np.ndarray, images: list[tuple[np.ndarray, dict[str, Any]]]
+    path: Path, mesh_from_world: np.ndarray, images: Sequence[PosedPicture | PosedFrame]
 ) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
-    """Result of `_cameras`, from camera-to-world matrices with OpenGL's axes and camera keys."""
+    """Result of `_cameras`, from the pictures of a file."""
     lenses, size = [], (0, 0)
-    for pose, keys in images:
-        if keys.get("w") is None or keys.get("h") is None:
+    for image in images:
+        if image.camera.w is None or image.camera.h is None:
             raise InputError(f"{path} has no w and h, the size of the pictures.")
-        frame = PosedFrame(path.name, pose, path, None, checked(Camera, keys, str(path)))
-        K, size = frame_intrinsics(frame, (1, 1))
+        K, size = frame_intrinsics(image, (1, 1))
         lenses.append(K)
-    if not lenses:
-        raise InputError(f"{path} has no image with a pose; download it again.")
-    return (
-        mesh_from_world @ np.stack([pose for pose, _ in images]) @ GL_TO_CV,
-        np.stack(lenses),
-        size,
-    )
+    poses = np.stack([image.camera_to_world for image in images])
+    return mesh_from_world @ poses @ GL_TO_CV, np.stack(lenses), size
 
 
 def _labels(folder: Path) -> Labels:
@@ -192,14 +180,13 @@ def _labels(folder: Path) -> Labels:
     return Labels(listed | own, TABLE)
 
 
-def _ids(
-    groups: list[Group], parts: list[np.ndarray], labels: Labels, vertices: int
-) -> tuple[np.ndarray, np.ndarray, dict[int, str]]:
+def _ids(scan: AnnotatedMesh, labels: Labels) -> tuple[np.ndarray, np.ndarray, dict[int, str]]:
     """Number of each vertex, (V,) int32: k + 1 for group k, 0 for the room itself, -1 for no group;
     index into `STUFF` of each vertex, uint8; and the classes. A vertex that several groups share
     belongs to the smallest of them."""
-    numbers = np.full(vertices, -1, dtype=np.int32)
-    stuff = np.zeros(vertices, dtype=np.uint8)
+    groups, parts = scan.groups, scan.parts
+    numbers = np.full(len(scan.mesh.vertices_m), -1, dtype=np.int32)
+    stuff = np.zeros(len(numbers), dtype=np.uint8)
     classes = {}
     for k in sorted(range(len(groups)), key=lambda k: -len(parts[k])):
         is_shell = labels.is_shell(groups[k].category)
@@ -215,11 +202,3 @@ def _most_common(corners: np.ndarray) -> np.ndarray:
     """Value of the majority of each face's corners, (F,); the first corner's if all differ."""
     first, second, third = corners.T
     return np.where(second == third, second, first)
-
-
-def _nearest_faces(
-    mesh: Mesh, world_to_camera: np.ndarray, K: np.ndarray, image_size: tuple[int, int]
-) -> np.ndarray:
-    """Image of the nearest faces' indices; -1 where there is no face."""
-    projection = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
-    return rasterize(mesh.vertices_m, mesh.faces, world_to_camera, projection, image_size)[0]

@@ -22,16 +22,11 @@ import numpy as np
 from pydantic import BaseModel, RootModel
 
 from data_prep.engine.source import RoomTask
-from data_prep.readers.frames import Y_UP
-from data_prep.readers.nyu40 import ids_and_classes
-from data_prep.readers.rooms import (
-    FoundRoom,
-    FramedRoom,
-    Reader,
-    chosen_frames,
-    corners_of,
-    sampled,
-)
+from data_prep.readers.files import by_number
+from data_prep.readers.frames import Y_UP, chosen_frames, sampled
+from data_prep.readers.labels import ids_and_classes
+from data_prep.readers.reader import FoundRoom, Reader
+from data_prep.readers.rooms import FramedRoom, corners_of, numbered
 from sceneprior.core.cameras import odd_field_of_view
 from sceneprior.core.checked import checked, shown
 from sceneprior.core.errors import InputError
@@ -77,7 +72,7 @@ class _Structure(BaseModel):
     lineJunctionMatrix: list[list[int]]  # noqa: N815
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Structured3D(Reader):
     """Structured3D's perspective views."""
 
@@ -105,14 +100,14 @@ class Structured3D(Reader):
                 found[room_id] = FoundRoom(mask_size(views[0] / "instance.png"))
         return found
 
-    def read(self, task: RoomTask, max_side: int | None, max_views: int) -> FramedRoom:
+    def read(self, task: RoomTask) -> FramedRoom:
         """See `Reader.read`."""
         scene = self.folder / task.house
         room = scene / "2D_rendering" / task.room_id.removeprefix(f"{task.house}_")
         views = _views(room)
         cameras = [_read_camera(view / "camera_pose.txt") for view in views]
         poses = np.stack([pose for pose, _ in cameras])
-        choice = chosen_frames(str(room), poses, list(range(len(views))), max_views)
+        choice = chosen_frames(str(room), poses, range(len(views)), self.max_views)
         instances: list[np.ndarray] = []
         semantics: list[np.ndarray] = []
         intrinsics = []
@@ -123,7 +118,7 @@ class Structured3D(Reader):
             K[:2, 2] = half
             if odd := odd_field_of_view(float(K[0, 0]), size):
                 raise InputError(f"{views[k] / 'camera_pose.txt'}: {odd}.")
-            lines, K = sampled(size, max_side, K)
+            lines, K = sampled(size, self.max_side, K)
             intrinsics.append(K)
             for name, images in (("instance.png", instances), ("semantic.png", semantics)):
                 image = read_mask(views[k] / name).astype(np.int32)
@@ -137,17 +132,21 @@ class Structured3D(Reader):
         numbers[numbers == _NONE] = -1
         ids, classes, stuff = ids_and_classes(numbers, np.stack(semantics), str(room))
         floor_m, ceiling_y, floor_y = _read_floor(scene / "annotation_3d.json", room.name)
+        boxes, notes = _read_boxes(scene / "bbox_3d.json"), tuple(choice.notes("image of ids"))
         return FramedRoom(
-            ids, classes, Y_UP @ poses[list(choice.frames)], np.stack(intrinsics),
-            _read_boxes(scene / "bbox_3d.json"), floor_y, floor_m, ceiling_y,
-            stuff, tuple(choice.notes("image of ids")),
-        )  # fmt: skip
+            **numbered(ids, classes, self.label_set, task.room_id, boxes, stuff, notes),
+            camera_to_world=Y_UP @ poses[list(choice.frames)],
+            intrinsics=np.stack(intrinsics),
+            floor_y=floor_y,
+            floor_m=floor_m,
+            ceiling_y=ceiling_y,
+        )
 
 
 def _views(room: Path) -> list[Path]:
     """Folders of a room's perspective views, by number."""
-    folders = (room / "perspective" / "full").glob("*/instance.png")
-    return sorted((path.parent for path in folders), key=lambda path: (len(path.name), path.name))
+    images = (room / "perspective" / "full").glob("*/instance.png")
+    return by_number([path.parent for path in images])
 
 
 def _read_camera(path: Path) -> tuple[np.ndarray, np.ndarray]:

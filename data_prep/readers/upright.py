@@ -1,4 +1,4 @@
-"""Upright 3D boxes of tracked objects, fitted to their 2D boxes in all views, without ground truth.
+"""Upright 3D boxes of tracked objects, fitted to their 2D boxes in all views, and the floor below.
 
 Each box has seven parameters: centre (3), logarithms of the sizes (3), yaw.
 """
@@ -9,6 +9,7 @@ import numpy as np
 
 from sceneprior.core.boxes import CUBE_CORNERS
 from sceneprior.core.cameras import camera_centers, nearest_to_rays, pixel_rays
+from sceneprior.core.observations import Observations
 from sceneprior.core.shards import Sightings
 
 VIEWS_AT_MOST = 10
@@ -23,6 +24,14 @@ _DELTA = 1e-5
 """Step of the finite differences, in metres, logarithms and radians."""
 _SIDES_AT_LEAST = 8
 """Minimum number of unoccluded sides, over all views, to determine a box's seven parameters."""
+
+_MISFIT_SHARE = 0.01
+"""Maximum mean distance between a projected box and its 2D boxes, relative to the image's longer
+side, for its bottom to be used."""
+_AGREE_M = 0.1
+"""Maximum height difference between the bottoms of pieces on the same floor."""
+_LOWER_SIDES = 2
+"""Minimum number of views in which the lower side of a piece is unoccluded."""
 
 
 class _Given(NamedTuple):
@@ -83,6 +92,26 @@ def fit_upright(
             rows = np.flatnonzero(told)[better]
             best[rows], misfit[rows] = found[better], mean[better]
     return _corners(best), misfit
+
+
+def find_floor(
+    seen: Observations, world_to_camera: np.ndarray, intrinsics: np.ndarray
+) -> tuple[float, int] | None:
+    """Find the height at which the lowest pieces end, along y, and the number of these pieces.
+
+    An upright box is fitted to each piece; the floor is at the bottom of the lowest boxes. The
+    cameras' world is in metres, and its y points up. None if fewer than two pieces agree.
+    """
+    height, width = seen.instance_ids.shape[1:]
+    corners, misfit_px = fit_upright(seen, (height, width), world_to_camera, intrinsics)
+    believed = misfit_px < _MISFIT_SHARE * max(width, height)
+    believed &= own_sides(seen, (height, width))[..., 3].sum(axis=0) >= _LOWER_SIDES
+    ends = corners[believed, :, 1].min(axis=1).tolist()
+    for end in sorted(ends):
+        same = [other for other in ends if 0 <= other - end <= _AGREE_M]
+        if len(same) >= max(2, len(ends) / 4):  # a single one may be wrong
+            return float(np.median(same)), len(same)
+    return None
 
 
 def _given(

@@ -29,9 +29,8 @@ from data_prep.engine.build import Job, build_shards
 from data_prep.front.furnished import Room
 from data_prep.front.recipe import load_recipe
 from data_prep.homes.make import make_homes
-from data_prep.readers.scannet.labels import Labels, read_labels
-from data_prep.readers.scannet.scans import ScanSettings
-from data_prep.readers.scannet.source import ScanNetSource
+from data_prep.readers.labels import Labels, read_labels
+from data_prep.readers.scannet import ScanNet
 from sceneprior.core.classes import STUFF, label_set
 from sceneprior.core.shards import Shard, list_shards
 
@@ -51,10 +50,13 @@ def folder(tmp_path_factory) -> Path:
         patch.setattr(sys, "argv", ["made_scans.py", str(path / "homes"), str(out)])
         made_scans.main()
     (path / "printed.txt").write_text(text.getvalue())
-    source = ScanNetSource(
-        out / "scans", out / "labels.tsv", ScanSettings(frame_step=1), out / "train.txt",
-        out / "val.txt",
-    )  # fmt: skip
+    source = ScanNet(
+        out / "scans",
+        labels=out / "labels.tsv",
+        frame_step=1,
+        train=out / "train.txt",
+        val=out / "val.txt",
+    )
     build_shards(Job(source, path / "shards", workers=1))
     return path
 

@@ -1,8 +1,10 @@
-"""Transforms the cameras of a posed room to the room frame: up direction, floor, origin."""
+"""Turns the cameras of a posed room upright: finds the up direction, and axes that are wrong."""
+
+from collections.abc import Sequence
 
 import numpy as np
 
-from data_prep.readers.frames import GL_TO_CV, is_pose, room_cameras
+from data_prep.readers.frames import GL_TO_CV
 from data_prep.readers.posed.recording import Recording
 from sceneprior.core.errors import InputError
 
@@ -19,7 +21,7 @@ cameras look the same way, their tilt cannot be determined."""
 
 
 def upright_cameras(
-    recording: Recording, frames: list[int], up: str, metres_per_unit: float
+    recording: Recording, frames: Sequence[int], up: str, metres_per_unit: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rotate cameras to a world whose y points up, in metres.
 
@@ -66,43 +68,24 @@ def _turn_of_cameras(recording: Recording, poses: np.ndarray) -> np.ndarray:
     return turn
 
 
-def cameras_in_room(
-    recording: Recording, upright: np.ndarray, turn: np.ndarray, floor: float
-) -> np.ndarray:
-    """World-to-camera transforms in the room frame, (views, 4, 4), of `upright_cameras`.
-
-    In the room frame, y points up, the floor is at y = 0, and the origin is at `floor_center_m` or,
-    without one, below the centre of the cameras' bounding box.
-    """
-    eyes = upright[:, :3, 3]
-    low, high = eyes.min(axis=0), eyes.max(axis=0)
-    if low[1] <= floor:
+def floor_center(recording: Recording, turn: np.ndarray) -> np.ndarray | None:
+    """x, z of the floor's centre in the world of `upright_cameras`; None if the file has none."""
+    if recording.floor_center_m is None:
+        return None
+    level = [axis for axis in range(3) if abs(turn[1, axis]) < 0.5]
+    if len(level) != 2 or not np.isin(np.abs(turn[1]), (0.0, 1.0)).all():
         raise InputError(
-            f"{recording.path}: its lowest camera is at {low[1]:.2f} m, below the floor at "
-            f"{floor:.2f} m: {_why_below(recording, turn)}"
+            f"{recording.path}: floor_center_m is along two level axes, but none of this world's "
+            "is level; leave it out, or turn the poses and name the axis with --up."
         )
-    middle = (low[0] + high[0]) / 2, (low[2] + high[2]) / 2
-    if recording.floor_center_m is not None:
-        first, second = recording.floor_center_m
-        level = [axis for axis in range(3) if abs(turn[1, axis]) < 0.5]
-        if len(level) != 2 or not np.isin(np.abs(turn[1]), (0.0, 1.0)).all():
-            raise InputError(
-                f"{recording.path}: floor_center_m is along two level axes, but none of this "
-                "world's is level; leave it out, or turn the poses and name the axis with --up."
-            )
-        center = np.zeros(4)
-        center[level] = first, second
-        x, _, z, _ = turn @ center
-        middle = x, z
-    room_from_upright = np.eye(4)
-    room_from_upright[:3, 3] = -middle[0], -floor, -middle[1]
-    return room_cameras(upright, room_from_upright)
+    center = np.zeros(4)
+    center[level] = recording.floor_center_m
+    return (turn @ center)[[0, 2]]
 
 
-def _why_below(recording: Recording, turn: np.ndarray) -> str:
+def why_below_floor(recording: Recording, turn: np.ndarray) -> str:
     """Likely reason why cameras are below the floor, as the end of a sentence."""
-    written = np.stack([frame.camera_to_world for frame in recording.frames])
-    written = written[is_pose(written)]
+    written = recording.good_poses()
     axis = int(np.abs(turn[1, :3]).argmax())
     # The sideways axis of an upright camera is level: it has no part along the axis up.
     level, level_if_inverted = np.abs(written[:, axis, 0]), np.abs(written[:, 0, axis])
@@ -119,8 +102,7 @@ def _why_below(recording: Recording, turn: np.ndarray) -> str:
 
 def seems_up(recording: Recording) -> str | None:
     """Axis along which the cameras' up vectors point, `y` or `z`; None if neither is clear."""
-    poses = np.stack([frame.camera_to_world for frame in recording.frames])
-    tops = poses[is_pose(poses), :3, 1]
+    tops = recording.good_poses()[:, :3, 1]
     if not len(tops):
         return None
     mean = tops.mean(axis=0)

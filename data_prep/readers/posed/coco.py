@@ -1,20 +1,23 @@
-"""Reads COCO annotation files (JSON) of single images, of images with tracks, and of videos.
+"""Masks as polygons or run lengths in COCO's JSON: of images, of images with tracks, of videos.
 
 Source: cocodataset.org (data format); the format of YouTube-VIS, whose annotations have one mask
-per frame in `segmentations`; CocoVID and CVAT, whose annotations of images have a track.
+per frame in `segmentations`; CocoVID and CVAT, whose annotations of images have a track. The JSON
+that a demo of Grounded-SAM-2 writes for each picture: `grounded_sam2_local_demo.py` in
+IDEA-Research/Grounded-SAM-2.
 """
 
 from abc import abstractmethod
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 
-from data_prep.readers.posed.mask_format import MaskFormat, instead, main_classes
+from data_prep.readers.posed.masks import FrameMask, MaskFormat, instead, main_classes
 from data_prep.readers.posed.recording import PosedFrame
+from data_prep.readers.posed.sam2 import LABELS, MASKS, PREFIX, GroundedSam2
 from sceneprior.core.checked import checked, shown
 from sceneprior.core.coco import (
     CROWD,
@@ -27,11 +30,11 @@ from sceneprior.core.coco import (
     read_coco_json,
 )
 from sceneprior.core.errors import InputError
+from sceneprior.core.files import read_json
 from sceneprior.core.id_tables import LARGEST_ID
 
 FILES = ("*coco*.json", "instances*.json", "annotations*.json", "annotations/*.json")
 """Glob patterns of COCO's JSON in a room's folder."""
-_TRACKS = ("track_id", "instance_id")
 
 
 @dataclass
@@ -49,6 +52,11 @@ class SegmentedFrame:
         """Add a mask; `where` names it within the frame."""
         self.masks.append((number, segmentation, f"{self.where}, {where}"))
         self.classes[number] = name
+
+    def read(self) -> np.ndarray:
+        """Ids, (height, width)."""
+        masks = ((k, decode(mask, self.size, where)) for k, mask, where in self.masks)
+        return paint(masks, self.size)
 
 
 class SegmentedFrames(MaskFormat):
@@ -68,26 +76,18 @@ class SegmentedFrames(MaskFormat):
                 f"{frame.where}: two pictures are named {shown(stem)}; a room has one of each name."
             )
 
-    def has(self, frame: PosedFrame) -> bool:
-        return frame.stem in self.frames
+    def of(self, frame: PosedFrame) -> FrameMask | None:
+        found = self.frames.get(frame.stem)
+        if found is None:
+            return None
+        return FrameMask(partial(getattr, found, "size"), found.read, lambda: found.classes)
 
     def wanted(self, frame: PosedFrame) -> str:
         return f"a picture {shown(frame.stem)} in {self.find(self.folder)[0]}{instead(self.frames)}"
 
-    def size(self, frame: PosedFrame) -> tuple[int, int]:
-        return self.frames[frame.stem].size
-
-    def read(self, frame: PosedFrame) -> np.ndarray:
-        found = self.frames[frame.stem]
-        masks = ((k, decode(mask, found.size, where)) for k, mask, where in found.masks)
-        return paint(masks, found.size)
-
     def classes(self) -> dict[int, str]:
         classes, self.notes = main_classes(frame.classes for frame in self.frames.values())
         return classes
-
-    def frame_classes(self, frame: PosedFrame) -> dict[int, str]:
-        return self.frames[frame.stem].classes
 
 
 class _Image(BaseModel):
@@ -121,7 +121,7 @@ class _ImageAnnotation(_Annotation):
     def track(self) -> CocoId | None:
         """The track id, which CVAT stores among the attributes."""
         attributes = self.attributes if isinstance(self.attributes, dict) else {}
-        for key in _TRACKS:
+        for key in ("track_id", "instance_id"):
             for value in (getattr(self, key), attributes.get(key)):
                 if isinstance(value, CocoId):
                     return value
@@ -133,16 +133,14 @@ class _VideoAnnotation(_Annotation):
     segmentations: list[Any]
 
 
-class _Coco(BaseModel):
+class _Images(BaseModel):
     categories: list[Category]
-
-
-class _Images(_Coco):
     images: list[_Image]
     annotations: list[_ImageAnnotation]
 
 
-class _Videos(_Coco):
+class _Videos(BaseModel):
+    categories: list[Category]
     videos: list[_Video]
     annotations: list[_VideoAnnotation]
 
@@ -198,54 +196,95 @@ class CocoMasks(SegmentedFrames):
                     "among its categories."
                 )
         class_of = [CROWD if row.iscrowd else names[row.category_id] for row in coco.annotations]
-        if isinstance(coco, _Videos):
-            return self._of_video(coco, class_of, path)
-        return self._of_images(coco, class_of, path)
-
-    def _of_images(
-        self, coco: _Images, class_of: list[str], path: Path
-    ) -> dict[str, SegmentedFrame]:
-        of_id: dict[CocoId, SegmentedFrame] = {}
         frames: dict[str, SegmentedFrame] = {}
-        for image in coco.images:
-            frame = SegmentedFrame((image.height, image.width), str(path))
-            of_id[image.id] = frame
-            self.put(frames, image.file_name, frame)
-        tracks = dict.fromkeys(row.track for row in coco.annotations)
-        if self.tracked and len(tracks) >= LARGEST_ID:
-            raise InputError(f"{path} has {len(tracks)} tracks; expected at most {LARGEST_ID - 1}.")
-        number = {track: k for k, track in enumerate(tracks, start=1)}
-        for k, (row, name) in enumerate(zip(coco.annotations, class_of, strict=True), start=1):
-            if row.image_id not in of_id:
-                raise InputError(
-                    f"{path}, annotation {shown(row.id)}: image {shown(row.image_id)} is not among "
-                    "its images."
-                )
-            own = number[row.track] if self.tracked else k
-            of_id[row.image_id].add(own, name, row.segmentation, f"annotation {shown(row.id)}")
+        if isinstance(coco, _Videos):
+            pictures = _frames_of_video(coco, class_of, path)
+        else:
+            pictures = _frames_of_images(coco, class_of, path, self.tracked)
+        for file_name, frame in pictures:
+            self.put(frames, file_name, frame)
         return frames
 
-    def _of_video(
-        self, coco: _Videos, class_of: list[str], path: Path
-    ) -> dict[str, SegmentedFrame]:
-        (video,) = coco.videos
-        count = len(video.file_names)
-        ordered = [SegmentedFrame((video.height, video.width), str(path)) for _ in range(count)]
-        if len(coco.annotations) >= LARGEST_ID:
+
+def _frames_of_images(
+    coco: _Images, class_of: list[str], path: Path, tracked: bool
+) -> list[tuple[str, SegmentedFrame]]:
+    ordered = [SegmentedFrame((image.height, image.width), str(path)) for image in coco.images]
+    of_id = {image.id: frame for image, frame in zip(coco.images, ordered, strict=True)}
+    tracks = dict.fromkeys(row.track for row in coco.annotations)
+    if tracked and len(tracks) >= LARGEST_ID:
+        raise InputError(f"{path} has {len(tracks)} tracks; expected at most {LARGEST_ID - 1}.")
+    number = {track: k for k, track in enumerate(tracks, start=1)}
+    for k, (row, name) in enumerate(zip(coco.annotations, class_of, strict=True), start=1):
+        if row.image_id not in of_id:
             raise InputError(
-                f"{path} has {len(coco.annotations)} objects; expected at most {LARGEST_ID - 1}."
+                f"{path}, annotation {shown(row.id)}: image {shown(row.image_id)} is not among "
+                "its images."
             )
-        for k, (row, name) in enumerate(zip(coco.annotations, class_of, strict=True), start=1):
-            if row.video_id != video.id or len(row.segmentations) != count:
-                raise InputError(
-                    f"{path}, annotation {shown(row.id)}: it has {len(row.segmentations)} masks of "
-                    f"video {shown(row.video_id)}, but video {shown(video.id)} has {count} frames; "
-                    "an annotation has a mask, or null, for each frame."
-                )
-            for at, mask in enumerate(row.segmentations):
-                if mask is not None:
-                    ordered[at].add(k, name, mask, f"annotation {shown(row.id)}, frame {at}")
+        own = number[row.track] if tracked else k
+        of_id[row.image_id].add(own, name, row.segmentation, f"annotation {shown(row.id)}")
+    return [(image.file_name, frame) for image, frame in zip(coco.images, ordered, strict=True)]
+
+
+def _frames_of_video(
+    coco: _Videos, class_of: list[str], path: Path
+) -> list[tuple[str, SegmentedFrame]]:
+    (video,) = coco.videos
+    count = len(video.file_names)
+    ordered = [SegmentedFrame((video.height, video.width), str(path)) for _ in range(count)]
+    if len(coco.annotations) >= LARGEST_ID:
+        raise InputError(
+            f"{path} has {len(coco.annotations)} objects; expected at most {LARGEST_ID - 1}."
+        )
+    for k, (row, name) in enumerate(zip(coco.annotations, class_of, strict=True), start=1):
+        if row.video_id != video.id or len(row.segmentations) != count:
+            raise InputError(
+                f"{path}, annotation {shown(row.id)}: it has {len(row.segmentations)} masks of "
+                f"video {shown(row.video_id)}, but video {shown(video.id)} has {count} frames; "
+                "an annotation has a mask, or null, for each frame."
+            )
+        for at, mask in enumerate(row.segmentations):
+            if mask is not None:
+                ordered[at].add(k, name, mask, f"annotation {shown(row.id)}, frame {at}")
+    return list(zip(video.file_names, ordered, strict=True))
+
+
+class _Found(BaseModel):
+    class_name: str
+    segmentation: Any
+
+
+class _Picture(BaseModel):
+    image_path: str
+    annotations: list[_Found]
+    img_width: int = Field(ge=1)
+    img_height: int = Field(ge=1)
+
+
+class GroundedSam2Images(SegmentedFrames):
+    """Ids of single images: the JSON that a demo writes for each picture, in `json_data/`.
+
+    The key `image_path` identifies the frame; the JSON's file name does not matter.
+    """
+
+    name = "grounded-sam2"
+    title = f"Grounded-SAM-2 of single images ({LABELS}/)"
+    tracked = False
+
+    @classmethod
+    def find(cls, folder: Path) -> list[Path]:
+        return [] if GroundedSam2.find(folder) else sorted((folder / LABELS).glob("*.json"))
+
+    @cached_property
+    def frames(self) -> dict[str, SegmentedFrame]:
         frames: dict[str, SegmentedFrame] = {}
-        for file_name, frame in zip(video.file_names, ordered, strict=True):
-            self.put(frames, file_name, frame)
+        count = 0
+        for path in self.find(self.folder):
+            where = f"{path} (there is no {MASKS}/{PREFIX}*.npy, so it is read as a single image's)"
+            picture = checked(_Picture, read_json(path), where)
+            frame = SegmentedFrame((picture.img_height, picture.img_width), str(path))
+            for row in picture.annotations:
+                count += 1
+                frame.add(count, row.class_name, row.segmentation, f"annotation {len(frame.masks)}")
+            self.put(frames, picture.image_path, frame)
         return frames

@@ -5,14 +5,14 @@ Source: COLMAP's documentation of its output format, and `src/colmap/sensor/mode
 
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sceneprior.core.checked import plain
+from data_prep.readers.posed.recording import Camera, PosedPicture
+from sceneprior.core.checked import checked, plain, shown
 from sceneprior.core.errors import InputError
 
 FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
@@ -33,17 +33,6 @@ _BYTES_A_POINT = 24
 _LONGEST_NAME = 4096
 
 
-@dataclass(frozen=True)
-class ColmapImage:
-    """A posed image of a model."""
-
-    name: str
-    camera_to_world: np.ndarray
-    """(4, 4) float64, OpenGL axes as in transforms.json, in the model's units."""
-    camera: dict[str, Any]
-    """Camera keys as in transforms.json."""
-
-
 def model_files(folder: Path) -> tuple[Path, Path] | None:
     """Find a model's files of cameras and of images, preferably binary; None without a model."""
     for name in FOLDERS:
@@ -54,14 +43,19 @@ def model_files(folder: Path) -> tuple[Path, Path] | None:
     return None
 
 
-def read_model(cameras: Path, images: Path) -> list[ColmapImage]:
+def read_model(cameras: Path, images: Path) -> list[PosedPicture]:
     """Read the images of a model, sorted by name."""
     binary = cameras.suffix == ".bin"
     try:
         known = dict((_binary_cameras if binary else _text_cameras)(cameras))
         rows = list((_binary_images if binary else _text_images)(images))
         made = [
-            ColmapImage(name, _camera_to_world(pose), known[camera]) for name, pose, camera in rows
+            PosedPicture(
+                name,
+                _camera_to_world(pose),
+                checked(Camera, known[camera], f"{images}, image {shown(name)}"),
+            )
+            for name, pose, camera in rows
         ]
     except KeyError as error:
         raise InputError(f"{images} names camera {error}, which {cameras.name} lacks.") from None
@@ -71,6 +65,8 @@ def read_model(cameras: Path, images: Path) -> list[ColmapImage]:
         raise InputError(
             f"{cameras.parent} holds no COLMAP model that can be read ({plain(str(error), 120)})."
         ) from None
+    if not made:
+        raise InputError(f"{images} has no image with a pose.")
     return sorted(made, key=lambda image: image.name)
 
 

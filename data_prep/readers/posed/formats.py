@@ -1,19 +1,19 @@
-"""Formats of `--from`: the tools that wrote a room's poses and masks, guessed from its files."""
+"""Parses `--from` and `--label-set`; guesses the tools that wrote a room's poses and masks."""
 
 import contextlib
+import json
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from data_prep.readers.posed.coco import CocoMasks
-from data_prep.readers.posed.grounded_sam2 import GroundedSam2, GroundedSam2Images
-from data_prep.readers.posed.id_pngs import IdPngs
-from data_prep.readers.posed.mask_format import MaskFormat
-from data_prep.readers.posed.panoptic import PanopticPngs
-from data_prep.readers.posed.sam2 import ObjectFolders
+from data_prep.readers.posed.coco import CocoMasks, GroundedSam2Images
+from data_prep.readers.posed.masks import MaskFormat
+from data_prep.readers.posed.pngs import IdPngs, PanopticPngs
+from data_prep.readers.posed.sam2 import GroundedSam2, ObjectFolders
 from data_prep.readers.posed.transforms import POSES, pose_files
 from sceneprior.core.checked import shown
+from sceneprior.core.classes import LABEL_SETS, label_set_name
 from sceneprior.core.errors import InputError
 
 _MASKS: tuple[type[MaskFormat], ...] = (
@@ -94,3 +94,38 @@ def read_formats(names: Iterable[str]) -> Formats:
                 "them, and one of the other kind."
             )
     return Formats(**given)
+
+
+def read_label_set(text: str) -> str:
+    """Resolve `--label-set` to the name of a label set, as for `label_set` in a config.
+
+    The text is such a name, or a file with one class per line or a JSON list. The file need not
+    contain `void`; lines that begin with # are skipped.
+    """
+    path = Path(text)
+    if not path.is_file():
+        if text in LABEL_SETS:
+            return text
+        if text.startswith("void,"):
+            return label_set_name([name.strip() for name in text.split(",")[1:]])
+        raise InputError(
+            f"--label-set {text} is neither a file with one class per line, nor one of "
+            f"{', '.join(LABEL_SETS)}, nor a list such as void,bed,chair."
+        )
+    try:
+        content = path.read_text(encoding="utf-8")
+        names = (
+            json.loads(content)
+            if path.suffix.lower() == ".json"
+            else [line.strip() for line in content.splitlines()]
+        )
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{path} holds no class names ({str(error)[:120]}).") from None
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise InputError(f"{path} holds no list of class names.")
+    try:
+        return label_set_name(
+            [name for name in names if name and name != "void" and not name.startswith("#")]
+        )
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None

@@ -1,17 +1,215 @@
-"""Reads a room's masks of instance ids, undistorts and downsamples them."""
+"""The masks of a room, in any tool's format: the interface of formats, and how they are read."""
+
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from data_prep.readers.frames import mask_intrinsics, sampled_lines
 from data_prep.readers.posed.lens import Lens, Straightened, straighten
-from data_prep.readers.posed.mask_format import MaskFormat
 from data_prep.readers.posed.recording import PosedFrame, frame_intrinsics
-from sceneprior.core.checked import shown
+from data_prep.tracks.associate import UNKNOWN, FrameMasks, associate
+from sceneprior.core.checked import plain, shown
+from sceneprior.core.classes import VOID
 from sceneprior.core.errors import InputError
-from sceneprior.core.id_tables import IdTable, read_mask
+from sceneprior.core.id_tables import LARGEST_ID, IdTable, read_mask
+
+_LISTED = 3
+_MANY_IDS, _MANY_FRAMES, _ONCE = 12, 5, 0.8
+"""A room with at least these numbers of ids and frames is refused if more than this share of the
+ids occurs in a single frame only."""
 
 
-class MaskPixels:
+@dataclass(frozen=True)
+class FrameMask:
+    """The masks of one frame, still in their files."""
+
+    size: Callable[[], tuple[int, int]]
+    """(height, width)."""
+    read: Callable[[], np.ndarray]
+    """Ids, (height, width) integers, 0 for background."""
+    classes: Callable[[], dict[int, str]]
+    """Class of each id, if ids belong to single frames."""
+
+
+class MaskFormat(ABC):
+    """The masks of one room in one tool's format.
+
+    `folder` is the room's folder. `label_set_name` decides whether walls and floors are objects, in
+    formats that distinguish them from objects.
+    """
+
+    name: ClassVar[str]
+    """Value of `--from`."""
+    title: ClassVar[str]
+    """Name of the tool, and files or folders of the masks, for messages."""
+
+    def __init__(self, folder: Path, label_set_name: str):
+        self.folder, self.label_set_name = folder, label_set_name
+        self.notes: list[str] = []
+
+    @property
+    def tracked(self) -> bool:
+        """False if the ids belong to single images, whatever the option `--tracks` says."""
+        return True
+
+    @classmethod
+    @abstractmethod
+    def find(cls, folder: Path) -> list[Path]:
+        """All mask files of a room; empty if the room has no masks in this format."""
+
+    @abstractmethod
+    def of(self, frame: PosedFrame) -> FrameMask | None:
+        """The masks of a frame, even if they show no object; None if it has none."""
+
+    @abstractmethod
+    def wanted(self, frame: PosedFrame) -> str:
+        """Description, for messages, of the expected file of a frame's masks, and of what exists
+        instead."""
+
+    @abstractmethod
+    def classes(self) -> dict[int, str]:
+        """Class of each id, if ids are the same in all frames."""
+
+
+def main_classes(of_frames: Iterable[dict[int, str]]) -> tuple[dict[int, str], list[str]]:
+    """The most frequent class of each id over all frames, and a note on ids with several
+    classes."""
+    votes: dict[int, Counter[str]] = {}
+    for classes in of_frames:
+        for number, name in classes.items():
+            votes.setdefault(number, Counter())[name] += 1
+    changing = [
+        f"{number} ({', '.join(f'{plain(name)} {k}' for name, k in count.most_common())})"
+        for number, count in sorted(votes.items())
+        if len(count) > 1
+    ]
+    notes = [f"ids with several classes take the most frequent one: {_some(changing)}"]
+    most = {number: count.most_common(1)[0][0] for number, count in sorted(votes.items())}
+    return most, notes if changing else []
+
+
+def instead(names: Iterable[str]) -> str:
+    """Describe the names that exist where another name was expected, if there are any."""
+    listed = [plain(name) for name in sorted(names)]
+    return f", but there is {_some(listed)}: give masks the names of their frames" if listed else ""
+
+
+def _some(words: list[str]) -> str:
+    return ", ".join(words[:_LISTED]) + (", ..." if len(words) > _LISTED else "")
+
+
+class ReadMasks(NamedTuple):
+    """All masks of a room as `observe` takes them."""
+
+    ids: np.ndarray
+    """(views, height, width) unsigned: k + 1 for object k, n + 1 for what is unknown."""
+    object_class: np.ndarray
+    """(n + 1,), the last one is VOID."""
+    stuff: np.ndarray
+    """(views, height, width) indices into `STUFF`."""
+    intrinsics: np.ndarray
+    """(views, 3, 3)."""
+    notes: list[str]
+
+
+def read_tracked(
+    masks: MaskFormat, frames: list[PosedFrame], size: tuple[int, int], stored: tuple[int, int]
+) -> ReadMasks:
+    """Read masks whose ids are the same in all frames; see `_Pixels`."""
+    table = IdTable(masks.classes(), masks.label_set_name, str(masks.folder))
+    pixels = _Pixels(masks, size, stored)
+    ids, stuff, intrinsics = [], [], []
+    for frame in frames:
+        values, K = pixels.read(frame)
+        ids.append(table.ids(values))
+        stuff.append(table.stuff(values))
+        intrinsics.append(K)
+    notes = [*masks.notes, *table.notes]
+    if table.unlisted:
+        listed = ", ".join(map(str, sorted(table.unlisted)[:20]))
+        notes.append(f"masks show ids that the table of classes does not have ({listed}): void")
+    images = np.stack(ids)
+    _check_tracked(images, len(table.classes))
+    arrays = np.stack(stuff), np.stack(intrinsics)
+    return ReadMasks(images, table.classes, *arrays, notes + pixels.notes)
+
+
+def _check_tracked(images: np.ndarray, void: int) -> None:
+    """Raise an `InputError` if most ids occur in one frame only, as if each frame had its own
+    ids."""
+    frames_of = np.zeros(void + 1, dtype=np.int64)
+    for image in images:
+        frames_of[np.unique(image)] += 1
+    frames_of = frames_of[1:void]  # without the background and without masks of no class
+    count, once = int((frames_of > 0).sum()), int((frames_of == 1).sum())
+    if len(images) >= _MANY_FRAMES and count >= _MANY_IDS and once > _ONCE * count:
+        raise InputError(
+            f"{once} of its {count} ids are in one of {len(images)} frames only, expected the same "
+            "id for an object in all frames; --tracks auto finds the objects of such masks."
+        )
+
+
+def read_untracked(
+    masks: MaskFormat,
+    frames: list[PosedFrame],
+    size: tuple[int, int],
+    stored: tuple[int, int],
+    world_to_camera: np.ndarray,
+) -> ReadMasks:
+    """Read masks whose ids and classes belong to single frames, and find the objects they show."""
+    pixels = _Pixels(masks, size, stored)
+    images, intrinsics = (
+        np.stack(arrays) for arrays in zip(*map(pixels.read, frames), strict=True)
+    )
+    # Masks of all frames are numbered through.
+    numbers = np.where(images < 0, -1, 0)
+    class_names: dict[int, str] = {}
+    original_ids, unlisted = [0], 0
+    for image, number, frame in zip(images, numbers, frames, strict=True):
+        mask = masks.of(frame)
+        names = mask.classes() if mask is not None else {}
+        for k in np.unique(image[image > 0]).tolist():
+            if k not in names:
+                number[image == k] = -1
+                unlisted += 1
+                continue
+            class_names[len(original_ids)] = names[k]
+            number[image == k] = len(original_ids)
+            original_ids.append(k)
+    if (count := len(original_ids)) > LARGEST_ID:
+        raise InputError(
+            f"{masks.folder} has {count - 1} masks, expected at most {LARGEST_ID - 1}; use fewer "
+            "frames (--max-views)."
+        )
+    table = IdTable(class_names, masks.label_set_name, str(masks.folder))
+    ids = table.ids(numbers).astype(np.int32)
+    # The table's last id stands for masks without a class, whose content is unknown.
+    ids[ids == len(table.classes)] = UNKNOWN
+    kept = np.unique(ids[ids > 0])
+    new_id = np.zeros(len(table.classes) + 1, dtype=np.int32)
+    new_id[kept] = np.arange(1, len(kept) + 1)
+    number_of_id = np.zeros(len(kept) + 1, dtype=np.int64)
+    number_of_id[new_id[ids[ids > 0]]] = numbers[ids > 0]
+    ids = np.where(ids > 0, new_id[np.maximum(ids, 0)], ids)
+    given = np.array(original_ids)[number_of_id[1:]]
+    notes = [*table.notes, *pixels.notes]
+    if unlisted:
+        notes.append(f"{unlisted} masks have no class in their frame's table: void")
+    frame_masks = FrameMasks(ids, table.classes[kept - 1].astype(np.int64))
+    tracks = associate(frame_masks, world_to_camera, intrinsics, given)
+    count = len(tracks.object_class)
+    notes.append(f"{count} objects are found from {len(given)} masks (--tracks auto)")
+    found = np.where(tracks.ids < 0, count + 1, tracks.ids).astype(np.uint32)
+    classes = np.array([*tracks.object_class, VOID])
+    return ReadMasks(found, classes, table.stuff(numbers), intrinsics, notes)
+
+
+class _Pixels:
     """Reads the values of masks, all of one size, undistorted and downsampled.
 
     `size` is the (height, width) of all masks, and `stored` that of the downsampled images.
@@ -45,13 +243,13 @@ class MaskPixels:
             view = self._views[key]
             K, values = view.intrinsics, values[view.rows, view.columns]
         lines = [sampled_lines(*sides) for sides in zip(self._size, self._stored, strict=True)]
-        sampled = mask_intrinsics(K, self._size, self._size, self._stored)
-        return values[np.ix_(*lines)], sampled
+        return values[np.ix_(*lines)], mask_intrinsics(K, self._size, self._size, self._stored)
 
     def _values(self, frame: PosedFrame) -> np.ndarray:
-        """Read the ids of one frame, int32; -1 where they are unknown."""
-        ids = self._masks.read(frame).astype(np.int32)
-        size = self._size
+        mask, size = self._masks.of(frame), self._size
+        if mask is None:
+            raise InputError(f"{self._masks.wanted(frame)} is missing")
+        ids = mask.read().astype(np.int32)
         if ids.shape != size:
             raise InputError(
                 f"the mask of frame {shown(frame.name)} is {ids.shape[1]} x {ids.shape[0]} pixels, "
@@ -66,27 +264,3 @@ class MaskPixels:
                 )
             ids[known == 0] = -1
         return ids
-
-
-class RoomMasks:
-    """Masks of one room with tracked ids, and notes about them; see `MaskPixels`."""
-
-    def __init__(self, masks: MaskFormat, size: tuple[int, int], stored: tuple[int, int]):
-        self.table = IdTable(masks.classes(), masks.label_set_name, str(masks.folder))
-        self._notes = masks.notes
-        self._pixels = MaskPixels(masks, size, stored)
-
-    @property
-    def notes(self) -> list[str]:
-        """Notes on everything left out or changed so far."""
-        notes = [*self._notes, *self.table.notes]
-        if self.table.unlisted:
-            listed = ", ".join(map(str, sorted(self.table.unlisted)[:20]))
-            notes.append(f"masks show ids that the table of classes does not have ({listed}): void")
-        return notes + self._pixels.notes
-
-    def read(self, frame: PosedFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Read a frame's uint32 ids for `observe` and its stuff, at the stored size, and their
-        intrinsics."""
-        values, intrinsics = self._pixels.read(frame)
-        return self.table.ids(values), self.table.stuff(values), intrinsics

@@ -3,11 +3,12 @@
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from data_prep.readers.frames import is_pose
 from data_prep.readers.posed.lens import Lens
 from sceneprior.core.cameras import odd_field_of_view
 from sceneprior.core.checked import plain, shown
@@ -73,19 +74,27 @@ class Camera(BaseModel):
         return Lens((self.k1, self.k2, self.p1, self.p2, self.k3))
 
 
+class PosedPicture(NamedTuple):
+    """A picture as a tool's files describe it."""
+
+    name: str
+    camera_to_world: np.ndarray
+    """(4, 4) float64 as written: OpenGL axes (x right, y up, z backward), in the file's units."""
+    camera: Camera
+
+
 @dataclass(frozen=True)
 class PosedFrame:
-    """One frame of a room."""
+    """One frame of a room: a `PosedPicture`, and the files of its ids."""
 
     name: str
     """Value of `file_path`, for messages."""
     camera_to_world: np.ndarray
-    """(4, 4) float64 as written: OpenGL axes (x right, y up, z backward), in the file's units."""
+    camera: Camera
     instances: Path
     """PNG of ids, if masks are PNGs; it may be missing."""
-    known: Path | None
+    known: Path | None = None
     """PNG from `mask_path`; 0 marks pixels with unknown ids."""
-    camera: Camera
 
     @property
     def stem(self) -> str:
@@ -108,6 +117,11 @@ class Recording:
     metres_per_unit: float | None
     up: str = "z"
     """Axis of the poses' world that points up; `cameras` if no axis does, as in COLMAP's worlds."""
+
+    def good_poses(self) -> np.ndarray:
+        """The poses that are valid, (n, 4, 4), as written."""
+        poses = np.stack([frame.camera_to_world for frame in self.frames])
+        return poses[is_pose(poses)]
 
 
 def path_text(name: str) -> str:
@@ -159,7 +173,7 @@ def room_name(folder: Path) -> str:
 
 
 def frame_intrinsics(
-    frame: PosedFrame, mask_size: tuple[int, int]
+    frame: PosedFrame | PosedPicture, mask_size: tuple[int, int]
 ) -> tuple[np.ndarray, tuple[int, int]]:
     """Pinhole intrinsics of a frame, and the (height, width) of the picture that they refer to.
 
@@ -187,7 +201,7 @@ def frame_intrinsics(
     return np.array([[fl_x, 0, cx], [0, fl_y, cy], [0, 0, 1.0]]), (int(height), int(width))
 
 
-def _focal(frame: PosedFrame, key: str, side: float) -> float | None:
+def _focal(frame: PosedFrame | PosedPicture, key: str, side: float) -> float | None:
     """Focal length in pixels from `camera_angle_x` or `_y`; None if the key is missing."""
     angle_rad: float | None = getattr(frame.camera, key)
     if not angle_rad:

@@ -8,20 +8,25 @@ about the room are read.
 """
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from data_prep.readers.posed.apps import (
+    polycam_files,
+    read_keyframes,
+    read_metadata,
+    record3d_files,
+)
 from data_prep.readers.posed.colmap import model_files, read_model
-from data_prep.readers.posed.polycam import polycam_files, read_keyframes
-from data_prep.readers.posed.record3d import read_metadata, record3d_files
 from data_prep.readers.posed.recording import (
     Camera,
     Number,
     PosedFrame,
+    PosedPicture,
     Recording,
     check_one_png_a_frame,
     ids_path,
@@ -114,8 +119,8 @@ def read_recording(folder: Path, given: str | None = None) -> Recording:
         frames += _frames(path, data)
     if name != "nerfstudio":
         own = [path for path in files if path != folder / FILE_NAME]
-        for picture, pose, camera in _posed(name, own):
-            frames.append(PosedFrame(picture, pose, ids_path(folder, picture), None, camera))
+        for picture in _pictures(name, own):
+            frames.append(PosedFrame(*picture, ids_path(folder, picture.name)))
     check_one_png_a_frame(files[0], tuple(frames))
     metres_per_unit = _one("metres_per_unit", of_room)
     return Recording(
@@ -129,19 +134,11 @@ def read_recording(folder: Path, given: str | None = None) -> Recording:
     )
 
 
-def _posed(name: str, files: list[Path]) -> Iterator[tuple[str, np.ndarray, Camera]]:
-    """Picture, pose and camera of each frame of another tool's files."""
+def _pictures(name: str, files: list[Path]) -> Iterable[PosedPicture]:
+    """The pictures of another tool's files."""
     if name == "polycam":
-        yield from read_keyframes(files)
-    elif name == "record3d":
-        yield from read_metadata(files[0])
-    else:
-        images = read_model(*files)
-        if not images:
-            raise InputError(f"{files[1]} has no image with a pose.")
-        for image in images:
-            where = f"{files[1]}, image {shown(image.name)}"
-            yield image.name, image.camera_to_world, checked(Camera, image.camera, where)
+        return read_keyframes(files)
+    return read_metadata(files[0]) if name == "record3d" else read_model(*files)
 
 
 def _one(key: str, rooms: list[tuple[Path, _RoomEntry]]) -> Any:
@@ -179,9 +176,9 @@ def _frame(path: Path, data: dict[str, Any], number: int) -> PosedFrame:
     return PosedFrame(
         name,
         _matrix(where, item.get("transform_matrix")),
+        entry,
         path.parent / entry.instance_path if entry.instance_path else ids,
         path.parent / entry.mask_path if entry.mask_path else None,
-        entry,
     )
 
 

@@ -12,8 +12,7 @@ from data_prep.engine.build import Job, build_shards
 from data_prep.front.recipe import load_recipe
 from data_prep.front.source import FrontSource
 from data_prep.homes.make import make_homes
-from data_prep.readers.posed.source import PosedSource
-from data_prep.readers.posed.views import PosedSettings
+from data_prep.readers.posed.reader import Posed
 from sceneprior.core.classes import label_set
 from sceneprior.core.shards import Shard, iterate_rooms, read_index
 
@@ -104,6 +103,5 @@ def of_ids(change: Callable[[np.ndarray, int], np.ndarray]) -> Callable[[Path, d
 
 def shards_of(folder: Path, out: Path, label_set_name: str = "front3d_bedroom", **settings) -> Path:
     """Shards of captures."""
-    source = PosedSource(folder, label_set_name, PosedSettings(**settings))
-    build_shards(Job(source, out))
+    build_shards(Job(Posed(folder, classes=label_set_name, **settings), out))
     return out

@@ -12,9 +12,8 @@ from data_prep.engine.build import Job, build_shards
 from data_prep.front.recipe import load_recipe
 from data_prep.front.source import FrontSource
 from data_prep.homes.make import make_homes
-from data_prep.readers.posed.source import PosedSource
-from data_prep.readers.scannet.scans import ScanSettings
-from data_prep.readers.scannet.source import ScanNetSource
+from data_prep.readers.posed.reader import Posed
+from data_prep.readers.scannet import ScanNet
 
 OPENGL = np.diag([1.0, -1, -1, 1])
 
@@ -37,7 +36,7 @@ def scans(folder):
         for eye in [(4.5, 1.0, 1.5), (2.2, -2.6, 1.7), (-2.0, 1.5, 1.9)]:
             scan.look(eye, (1.7, 1.4, 0.5))
         scan.write(mask_size=(242, 324))
-    source = ScanNetSource(data, write_table(data / "labels.tsv"), ScanSettings(frame_step=1))
+    source = ScanNet(data, labels=write_table(data / "labels.tsv"), frame_step=1)
     build_shards(Job(source, folder))
 
 
@@ -53,7 +52,7 @@ def posed(folder, written=lambda poses: poses):
         room.write(**known)
         room.poses = list(written(np.stack(room.poses)))
         room.write_transforms(room.data | known)
-    build_shards(Job(PosedSource(data, "void,bed,chair,sofa,backpack"), folder))
+    build_shards(Job(Posed(data, classes="void,bed,chair,sofa,backpack"), folder))
 
 
 KINDS = {"homes": homes, "scans": scans, "posed": posed}

@@ -24,11 +24,9 @@ from scipy.spatial.transform import Rotation
 
 from data_prep.engine.source import PreparedRoom, Source
 from data_prep.engine.workers import pool
-from data_prep.readers.posed.source import PosedSource
-from data_prep.readers.posed.views import PosedSettings
-from data_prep.readers.scannet.scans import ScanSettings
-from data_prep.readers.scannet.source import ScanNetSource
-from data_prep.readers.source import PublicSource, open_reader
+from data_prep.readers import open_reader
+from data_prep.readers.posed.reader import Posed
+from data_prep.readers.scannet import ScanNet
 
 Write = Callable[[Path], Source]
 
@@ -47,7 +45,7 @@ def attic(folder: Path) -> PosedRoom:
 def posed(change: Callable[[PosedRoom], object], **settings: Any) -> Write:
     def write(folder: Path) -> Source:
         change(attic(folder / "attic"))
-        return PosedSource(folder, SET, PosedSettings(**settings))
+        return Posed(folder, classes=SET, **settings)
 
     return write
 
@@ -72,7 +70,7 @@ def shaken(folder: Path) -> Source:
         wrong[:3, 3] += 0.01 * way
         room.poses[k] = turn @ wrong
     room.write_transforms(room.data)
-    return PosedSource(folder, "void,bed,chair,cabinet,nightstand,lamp")
+    return Posed(folder, classes="void,bed,chair,cabinet,nightstand,lamp")
 
 
 def colmap(model: str, binary: bool) -> Write:
@@ -82,7 +80,7 @@ def colmap(model: str, binary: bool) -> Write:
 def public(name: str, write: Callable[[Path, PosedRoom], object], **settings: Any) -> Write:
     def written(folder: Path) -> Source:
         write(folder, furnished(folder))
-        return PublicSource(open_reader(name, folder), **settings)
+        return open_reader(name, folder, **settings)
 
     return written
 
@@ -98,7 +96,7 @@ def hypersim(shift: float, horizontal: float) -> Callable[[Path, PosedRoom], obj
 def scannet(folder: Path) -> Source:
     make_scan(folder / "scans" / "scene0000_00").write(mask_size=(242, 324))
     table = write_table(folder / "labels.tsv")
-    return ScanNetSource(folder / "scans", table, ScanSettings(1, image_size=(121, 162)))
+    return ScanNet(folder / "scans", labels=table, frame_step=1, image_size=(121, 162))
 
 
 def unaligned(folder: Path) -> Source:
@@ -108,7 +106,7 @@ def unaligned(folder: Path) -> Source:
     scan.write(mask_size=(242, 324))
     scan.path(".txt").write_text("sceneType = Bedroom / Hotel\n")
     table = write_table(folder / "labels.tsv", ROOM_TABLE)
-    return ScanNetSource(folder / "scans", table, ScanSettings(1))
+    return ScanNet(folder / "scans", labels=table, frame_step=1)
 
 
 FORMATS: dict[str, Write] = {

@@ -1,0 +1,272 @@
+"""Reads the user's own posed pictures with masks (docs/posed_data.md): a folder is a room."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from data_prep.engine.plan import digest, digest_of_files, seeded_split
+from data_prep.engine.source import Line, RoomTask
+from data_prep.readers.frames import chosen_frames, room_cameras, shrunk
+from data_prep.readers.posed.cameras import (
+    UP,
+    floor_center,
+    seems_up,
+    upright_cameras,
+    why_below_floor,
+)
+from data_prep.readers.posed.formats import Formats, mask_files
+from data_prep.readers.posed.masks import FrameMask, MaskFormat, read_tracked, read_untracked
+from data_prep.readers.posed.pngs import TABLES
+from data_prep.readers.posed.recording import INSTANCES, Recording, room_name
+from data_prep.readers.posed.transforms import POSES, pose_files, read_recording
+from data_prep.readers.reader import FoundRoom, Reader
+from data_prep.readers.rooms import FramedRoom
+from sceneprior.core.classes import label_set
+from sceneprior.core.errors import InputError
+from sceneprior.core.shards import thinned_stuff
+
+TRACKS = ("given", "auto")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Posed(Reader):
+    """Posed pictures: `folder` is one room, or a folder of rooms."""
+
+    name: ClassVar = "posed"
+    scene_word: ClassVar = ("room", "a room's folder")
+    surveys_all: ClassVar = True
+    split_hint: ClassVar = ""
+    classes: str
+    """Name of the label set."""
+    max_side: int | None = None
+    formats: Formats = field(default_factory=Formats)
+    """The tools that wrote the poses and the masks."""
+    test_share: float = 0.1
+    """Share of rooms in the split `test`, which gets at least one of several rooms; 0 puts all
+    rooms in `train`."""
+    up: str = "auto"
+    """Up direction of the poses' world: the axis `z` or `y`, or `cameras`, which estimates it from
+    cameras held upright. `auto` is z, as in nerfstudio's files, or `cameras` for COLMAP's."""
+    floor_m: float | None = None
+    """Height of the floor in rooms whose file has none; None estimates it (`find_floor`)."""
+    camera_height_m: float = 1.2
+    """Height of the lowest camera above the floor, assumed if the floor cannot be estimated."""
+    metres_per_unit: float = 1.0
+    """Scale in rooms whose file has none. Poses from pictures alone (COLMAP) have no unit."""
+    tracks: str = "given"
+    """One of `TRACKS`: ids are `given` for all frames, or `auto` finds objects from masks whose ids
+    have no meaning across frames."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.up not in UP:
+            raise InputError(f"up is '{self.up}'; choose from {', '.join(UP)}.")
+        if self.tracks not in TRACKS:
+            raise InputError(f"tracks is '{self.tracks}'; choose from {', '.join(TRACKS)}.")
+        for name in ("camera_height_m", "metres_per_unit"):
+            if not 0 < getattr(self, name) < float("inf"):
+                raise InputError(f"{name} is {getattr(self, name)}; it must be above 0.")
+        if self.floor_m is not None and not math.isfinite(self.floor_m):
+            raise InputError(f"floor_m is {self.floor_m}; expected a height in metres.")
+
+    @property
+    def label_set(self) -> str:
+        return self.classes
+
+    def options(self) -> dict[str, Any]:
+        """See `Reader.options`."""
+        label_set(self.label_set)
+        if not 0 <= self.test_share < 1:
+            raise InputError(
+                f"test_share is {self.test_share}; expected a share from 0 to below 1."
+            )
+        names = ("label_set", "up", "floor_m", "camera_height_m", "metres_per_unit", "max_side",
+                 "tracks", "max_views")  # fmt: skip
+        formats = {"poses": self.formats.poses, "masks": self.formats.masks}
+        return {"from": formats, **{name: getattr(self, name) for name in names}}
+
+    def fingerprint(self, scenes: list[str]) -> dict[str, Any]:
+        """See `Reader.fingerprint`: names and sizes of files are part of it, so that shards of
+        older masks or classes are not reused."""
+        folders = self._folders()
+        files = {
+            name: digest_of_files(
+                pose_files(room, self.formats.poses)[1]
+                + [room / table for table in TABLES if (room / table).is_file()]
+                + mask_files(room)
+            )
+            for name, room in folders.items()
+            if name in scenes
+        }
+        return {"test_share": self.test_share, "rooms": digest(repr(sorted(files.items())))}
+
+    def scenes(self) -> list[str]:
+        """See `Reader.scenes`."""
+        return [*self._folders()]
+
+    def rooms(self, scene: str) -> dict[str, FoundRoom]:
+        """The folder as one room, at the size at which it would be stored."""
+        recording, masks = self.open(self._folders()[scene])
+        of_frames = masks_of_frames(recording, masks)
+        return {scene: FoundRoom(shrunk(of_frames[min(of_frames)].size(), self.max_side))}
+
+    def split_rooms(self, rooms: Mapping[str, str]) -> tuple[dict[str, str], list[Line]]:
+        """See `Reader.split_rooms`."""
+        drawn = seeded_split(rooms, self.seed, self.test_share)
+        return {name: drawn[name] for name in rooms}, []
+
+    def read(self, task: RoomTask) -> FramedRoom:
+        """Read the poses and the masks of a room."""
+        folders = self._folders()
+        if task.house not in folders:
+            raise InputError(f"{self.folder} no longer has this room; restore its folder.")
+        recording, masks = self.open(folders[task.house])
+        of_frames = masks_of_frames(recording, masks)
+        choice = chosen_frames(
+            str(recording.path),
+            np.stack([frame.camera_to_world for frame in recording.frames]),
+            of_frames.keys(), self.max_views, mask="mask", hint="",
+            names=[frame.name for frame in recording.frames],
+        )  # fmt: skip
+        frames = [recording.frames[k] for k in choice.frames]
+        upright, turn = upright_cameras(recording, choice.frames, self.up, self.metres_per_unit)
+        try:
+            size = of_frames[min(of_frames)].size()
+            sizes = size, shrunk(size, self.max_side)
+            if self.tracks == "auto" or not masks.tracked:
+                made = read_untracked(masks, frames, *sizes, room_cameras(upright))
+            else:
+                made = read_tracked(masks, frames, *sizes)
+        except InputError as error:
+            raise InputError(f"{recording.path}: {str(error).removesuffix('.')}.") from None
+        return FramedRoom(
+            where=str(recording.path),
+            ids=made.ids,
+            object_class=made.object_class,
+            camera_to_world=upright,
+            intrinsics=made.intrinsics,
+            stuff=thinned_stuff(made.stuff),
+            notes=(*choice.notes("mask"), *made.notes),
+            may_err=True,
+            world_from_file=turn,
+            poses_file=recording.path.relative_to(recording.folder).as_posix(),
+            floor_y=recording.floor_m if recording.floor_m is not None else self.floor_m,
+            assumed_camera_m=self.camera_height_m,
+            center_m=floor_center(recording, turn),
+            why_below=f": {why_below_floor(recording, turn)}",
+        )
+
+    def _folders(self) -> dict[str, Path]:
+        """Folder of each room by the room's name."""
+        return {room_name(room): room for room in find_rooms(self.folder, self.formats.poses)}
+
+    def open(self, room: Path) -> tuple[Recording, MaskFormat]:
+        """Poses and masks of a room's folder."""
+        recording = read_recording(room, self.formats.poses)
+        return recording, self.formats.masks_of(room, self.label_set)
+
+    def found(self) -> list[str]:
+        """Sentences that name the tools whose files were found, for formats that were guessed."""
+        return self.formats.found(self._folders().values())
+
+    def assumptions(self) -> list[str]:
+        """Sentences on values that the files lack and that are assumed, printed first."""
+        recordings: list[Recording] = []
+        untracked: list[str] = []
+        for room in self._folders().values():
+            try:
+                recording, masks = self.open(room)
+                untracked += [] if masks.tracked else [masks.title]
+            except InputError:
+                continue  # the report will have the error
+            recordings.append(recording)
+        count = len(recordings)
+        sentences = []
+        if single := sum(len(recording.frames) < 2 for recording in recordings):
+            sentences.append(
+                f"{single} of {count} rooms have only one frame, which shows no depth: objects are "
+                "lifted to 3D from at least two views, better twenty."
+            )
+        if untracked and self.tracks != "auto":
+            sentences.append(
+                f"In {len(untracked)} of {count} rooms ids belong to single images "
+                f"({untracked[0]}): objects are found from poses, masks and classes, as with "
+                "--tracks auto."
+            )
+        unknown = sum(recording.floor_m is None for recording in recordings)
+        if unknown and self.floor_m is None:
+            sentences.append(
+                f"{unknown} of {count} rooms give no floor_m: the floor is estimated from the "
+                "lowest pieces (median error 1 to 2 cm in our tests), or else assumed "
+                f"{self.camera_height_m:g} m below the lowest camera (error 21 cm); report.csv "
+                "says which. Measure the floor and give floor_m or --floor-m, or at least the "
+                "lowest camera's height with --camera-height-m."
+            )
+        unknown = sum(recording.metres_per_unit is None for recording in recordings)
+        if unknown and self.metres_per_unit == 1:
+            sentences.append(
+                f"{unknown} of {count} rooms give no metres_per_unit: poses are assumed to be in "
+                "metres, which COLMAP's are not."
+            )
+        ups = [recording.up if self.up == "auto" else self.up for recording in recordings]
+        lying = sum(recording.up == "cameras" for recording in recordings)
+        if lying and self.up == "auto":
+            sentences.append(
+                f"{lying} of {count} rooms do not state the up direction: it is estimated from the "
+                "cameras, as if they were held upright. If they roll by 5 degrees, the median "
+                "error is 1.3 degrees, and floors rise by 5 cm in 2 m. Turn the poses until an "
+                "axis points up, and name it with --up."
+            )
+        for taken, axis in (("z", "y"), ("y", "z")):
+            other = sum(
+                up == taken and recording.up != "cameras" and seems_up(recording) == axis
+                for up, recording in zip(ups, recordings, strict=True)
+            )
+            if other:
+                sentences.append(
+                    f"In {other} of {count} rooms the tops of the pictures point along {axis}, but "
+                    f"{taken} is taken as up; should it be --up {axis}?"
+                )
+        return sentences
+
+
+def masks_of_frames(recording: Recording, masks: MaskFormat) -> dict[int, FrameMask]:
+    """Masks of the frames that have any, by the frame's place in the file."""
+    found = {k: masks.of(frame) for k, frame in enumerate(recording.frames)}
+    of_frames = {k: mask for k, mask in found.items() if mask is not None}
+    if not of_frames:
+        raise InputError(
+            f"{recording.path}: none of its {len(recording.frames)} frames has a mask; expected "
+            f"{masks.wanted(recording.frames[0])}."
+        )
+    return of_frames
+
+
+def find_rooms(folder: Path, poses: str | None = None) -> list[Path]:
+    """Find rooms: the folder itself if it holds poses (`pose_files`), else its sub-folders, sorted.
+
+    Sub-folders with `instances/` but no poses are included, so that the report mentions them.
+    """
+    if not folder.is_dir():
+        raise InputError(
+            f"No folder at {folder}; prep-posed reads a folder of rooms, unpacked from a .zip or "
+            ".r3d file."
+        )
+    if pose_files(folder, poses)[1]:
+        return [folder]
+    found = [
+        path
+        for path in sorted(folder.iterdir())
+        if path.is_dir() and (pose_files(path, poses)[1] or (path / INSTANCES).is_dir())
+    ]
+    if not found:
+        tools = POSES.values() if poses is None else [POSES[poses]]
+        raise InputError(
+            f"{folder} holds no poses of {', '.join(tools)}, and none of its sub-folders does "
+            "(unpack .zip and .r3d files)."
+        )
+    return found

@@ -1,1 +1,0 @@
-"""Source for ScanNet's raw scan folders (.sens, zips, JSON, PLY)."""

@@ -1,0 +1,440 @@
+"""Public data sets, from files to shards: classes, masks, cameras, boxes, splits, commands."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from pages import ROOT, commands_of, first_block
+from public_files import (
+    cam_from_uv,
+    classes_of,
+    expected_corners,
+    furnished,
+    write_blenderproc,
+    write_hypersim,
+    write_scannetpp,
+    write_structured3d,
+)
+from refusals import refused
+from scan_files import write_table
+
+from data_prep.engine.source import RoomTask
+from data_prep.engine.workers import pool
+from data_prep.inspection.agreement import boxes_around, hull_of
+from data_prep.readers import open_reader
+from data_prep.readers.frames import GL_TO_CV, Y_UP
+from data_prep.readers.heading import turn_matrix
+from data_prep.readers.hypersim import pinhole, straight_grid
+from data_prep.readers.labels import NYU40, SHELL, ids_and_classes
+from data_prep.readers.rooms import FramedRoom, numbered, prepare_room
+from data_prep.readers.upright import own_sides
+from sceneprior.core.boxes import quarter_rotation
+from sceneprior.core.classes import STUFF, label_set
+from sceneprior.core.errors import InputError
+from sceneprior.core.ground_truth import reference_scenes
+
+NAMES = label_set("scannet")
+
+
+def prepared(name, folder, **settings):
+    """Rooms of a folder by id, prepared without the engine."""
+    source = open_reader(name, folder, **settings)
+    return {task.room_id: source.prepare(task, None) for task in survey(source).rooms}
+
+
+def survey(source):
+    source.settings(source.only)
+    with pool(1) as run:
+        return source.survey(run)
+
+
+def splits_of(source):
+    return [task.split for task in survey(source).rooms]
+
+
+@pytest.fixture
+def room(tmp_path):
+    return furnished(tmp_path / "unused")
+
+
+def check(made, room, axes, origin, slack_px=0.0):
+    """Boxes of bed and chair, projected, bound their masks; the ground truth has these boxes.
+
+    A side of a mask that nothing hides is at most a pixel from that of the projection, since masks
+    are sampled at pixel centres; no mask reaches beyond the projection.
+    """
+    views, corners = made.views, expected_corners(room, axes, np.array(origin))
+    height, width = views.image_size
+    masks_px = views.boxes * np.array([width, height, width, height])
+    clear = own_sides(views, views.image_size)
+    assert clear.sum() >= 8
+    for k, points in enumerate(corners):
+        boxes_px = boxes_around(hull_of(points), views.world_to_camera, views.intrinsics)
+        within = (boxes_px - masks_px[:, k]) * (1, 1, -1, -1)
+        assert within[views.visible[:, k]].max() < 0.51 + slack_px
+        assert within[clear[:, k]].min() > -1.01 - slack_px
+    if made.truth is not None:
+        centers = [points.mean(axis=0) for points in corners]
+        sizes = [np.ptp(points, axis=0) for points in corners]
+        np.testing.assert_allclose(made.truth.centers_m[:2], centers, atol=1e-5)
+        np.testing.assert_allclose(made.truth.sizes_m[:2], sizes, atol=1e-5)
+
+
+def check_stuff(made, seen):
+    """Pixels of the floor and the wall are known in each view, and nothing is where furniture is.
+
+    `seen` are the true ids of the views.
+    """
+    assert made.views.image_size == seen.shape[1:] and max(seen.shape) < 240, "none is thinned"
+    expected = np.select([seen == 11, seen == 12], [STUFF.index("floor"), STUFF.index("wall")])
+    np.testing.assert_array_equal(made.views.stuff, expected)
+
+
+def test_blenderproc_is_mirrored_back_to_3d_front(room, tmp_path):
+    write_blenderproc(tmp_path / "renders", "house", room)
+    (made,) = prepared("blenderproc", tmp_path / "renders", max_side=None).values()
+    views = made.views
+    assert views.room_id == "house_MasterBedroom-1" and len(views.visible) == 4
+    assert classes_of(views, label_set("front3d_bedroom")) == ["double_bed", "chair"]
+    eyes = np.stack([pose[:3, 3] for pose in room.poses[:4]])
+    low, high = eyes.min(axis=0), eyes.max(axis=0)
+    middle = (low + high) / 2
+    # Blender's (x, y, z) is 3D-FRONT's (x, z, y): the images are mirror images.
+    check(made, room, (0, 2, 1), (middle[0], 0, middle[1]))
+    assert made.truth is None
+    mirrored = views.instance_ids[0][:, ::-1]
+    assert (mirrored == 1)[room.ids(0) == 3].all() and (mirrored == 3)[room.ids(0) == 7].all()
+    assert (mirrored == 0)[np.isin(room.ids(0), (11, 12))].all()
+
+
+def test_blenderproc_knows_classes_by_its_own_table_and_hides_other_rooms(room, tmp_path):
+    folder = tmp_path / "renders"
+    write_blenderproc(folder, "house", room)
+    (folder / "model_info.json").unlink()
+    table = "id,name\n0,Double Bed\n1,Floor Lamp\n2,void\n41,floor\n"
+    (folder / "blender_label_mapping.csv").write_text(table)
+    path = folder / "house" / "0.hdf5"
+    with h5py.File(path, "r+") as file:
+        parts = json.loads(bytes(file["instance_attribute_maps"][()]))
+        parts[2]["room_id"] = "Balcony-3"  # the chair
+        del file["instance_attribute_maps"]
+        file["instance_attribute_maps"] = np.bytes_(json.dumps(parts))
+    (made,) = prepared("blenderproc", folder, max_side=None).values()
+    names = label_set("front3d_bedroom")
+    assert classes_of(made.views, names)[0] == "double_bed"
+    void = len(made.views.object_class) + 1
+    chair = room.ids(0)[:, ::-1] == 300
+    assert (made.views.instance_ids[0][chair] == void).all()
+
+
+@pytest.mark.parametrize("shifts", [(0.0, 0.0), (0.25, 0.0), (-0.2, 0.3)])
+def test_hypersim_has_asset_units_and_tilted_image_planes(room, tmp_path, shifts):
+    room.focal_px = 75.0
+    write_hypersim(tmp_path / "scenes", "ai_001_002", room, cam_from_uv(room, *shifts))
+    (made,) = prepared("hypersim", tmp_path / "scenes", max_side=None).values()
+    assert made.views.room_id == "ai_001_002" and len(made.views.visible) == 4
+    assert classes_of(made.views, NAMES) == ["bed", "chair"]
+    assert made.notes == (
+        "1 of 5 frames have no image of ids; skipped",
+        "classes outside the label set are void: pillow (1)",
+    )
+    # (x, y, z) -> (y, z, x); the origin is below the middle of bed and chair.
+    # With both shifts the grid is skewed; straightening moves pixels by up to half of one.
+    check(made, room, (1, 2, 0), (0.05, 0, 0.2), slack_px=0.5 * all(shifts))
+    if not any(shifts):
+        kept = made.views.instance_ids == 0
+        assert set(np.unique(made.views.stuff[kept])) == {STUFF.index("floor"), STUFF.index("wall")}
+    assert not made.views.stuff[made.views.instance_ids > 0].any()
+    assert made.truth.height_m == pytest.approx(2.5)
+
+
+def test_structured3d_has_millimetres_a_floor_and_the_authors_split(room, tmp_path):
+    for k, scene in enumerate(("scene_00007", "scene_03249", "scene_03499")):
+        write_structured3d(tmp_path / "s3d", scene, f"48{k}", room)
+    made = prepared("structured3d", tmp_path / "s3d", max_side=None)
+    assert list(made) == ["scene_00007_480", "scene_03249_481", "scene_03499_482"]
+    one = made["scene_00007_480"]
+    assert classes_of(one.views, NAMES) == ["bed", "chair"]
+    check(one, room, (1, 2, 0), (-0.1, 0, 0.05))
+    check_stuff(one, np.stack([room.ids(k) for k in range(len(room.poses))]))
+    outline = [(y + 0.1, x - 0.05) for x, y in [(-3, -3.2), (3.1, -3.2), (3.1, 3), (-3, 3)]]
+    np.testing.assert_allclose(one.truth.floor_m, outline, atol=1e-5)
+    assert one.truth.height_m == pytest.approx(2.6)
+    assert splits_of(open_reader("structured3d", tmp_path / "s3d")) == ["train", "val", "test"]
+
+
+@pytest.mark.parametrize("poses", ["colmap", "nerfstudio", "iphone"])
+def test_scannetpp_is_drawn_from_its_annotated_mesh(room, tmp_path, poses):
+    write_scannetpp(tmp_path / "data", "0a5c013435", room, poses)
+    iphone = poses == "iphone"
+    side = 640 if iphone else None
+    (made,) = prepared("scannetpp", tmp_path / "data", max_side=side).values()
+    assert made.views.image_size == ((480, 640) if iphone else (96, 128))
+    assert classes_of(made.views, NAMES) == ["bed", "chair"]
+    check(made, room, (1, 2, 0), (0.05, 0, 0.2))
+    if not iphone:
+        ids = room.ids(1)
+        for number, thing in ((1, 3), (2, 300), (3, 7), (0, 11), (0, 12), (3, 0)):
+            assert (made.views.instance_ids[1][ids == thing] == number).all()
+        check_stuff(made, np.stack([room.ids(k) for k in range(len(room.poses))]))
+
+
+def test_masks_are_shrunk_with_their_cameras(room, tmp_path):
+    room.size, room.focal_px = (240, 320), 200.0
+    write_structured3d(tmp_path / "s3d", "scene_00007", "480", room)
+    (made,) = prepared("structured3d", tmp_path / "s3d", max_side=107, max_views=3).values()
+    assert made.views.image_size == (80, 107) and len(made.views.visible) == 3
+    check(made, room, (1, 2, 0), (-0.1, 0, 0.05))
+
+
+def test_the_commands_of_public_data_md_write_shards_that_verify(room, tmp_path, cli, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for k in range(3):
+        write_blenderproc(Path("renderings"), f"house_{k}", room)
+        write_hypersim(Path("evermotion_dataset/scenes"), f"ai_001_00{k}", room, cam_from_uv(room))
+        write_structured3d(Path("Structured3D"), f"scene_0{k}100", "480", room)
+        write_scannetpp(Path("scannetpp/data"), f"{k}a5c01", room)
+    commands = commands_of(first_block(ROOT / "docs" / "public_data.md", "bash"))
+    for _, *words in commands:
+        done = cli(*words, "--workers", 1)
+        assert done.exit_code == 0, done.output
+        if words[0] == "prep-dataset":
+            said = " ".join(done.stdout.split())
+            assert "train 2 rooms" in said or words[1] == "structured3d", said
+            checked = cli("inspect", words[-1], "--verify")
+            assert checked.exit_code == 0, (words, checked.output)
+            again = " ".join(cli(*words, "--workers", 1).stdout.split())
+            assert "0 shards made" in again
+    for name in ("hypersim", "structured3d", "scannetpp"):
+        for scene in reference_scenes(Path("out") / name / "shards", "train"):
+            assert [item.label for item in scene.objects] == ["bed", "chair"]
+
+
+@pytest.mark.parametrize("degrees", [30.0, -75.0])
+def test_rooms_at_an_angle_are_turned_with_their_boxes_and_floors(room, degrees):
+    """The world of a room is turned about y: ground truth and cameras are those of the plain room,
+    up to quarter turns."""
+    room.size, room.focal_px = (192, 256), 160.0
+    for eye in [(-2.5, 0.1, 1.5), (2.5, 0.3, 1.6), (0.1, 2.6, 1.4), (1.6, -2.4, 1.7)]:
+        room.look(eye, (0.1, 0.1, 0.3))
+    ids = np.stack([room.ids(k) for k in range(9)]).astype(np.int32)
+    classes = {3: "bed", 300: "chair", 7: "pillow", 11: "floor", 12: "wall"}
+    boxes = {thing.id: thing.corners @ Y_UP[:3, :3].T for thing in room.things[:3]}
+    plain = FramedRoom(
+        **numbered(ids, classes, "scannet", "a", boxes),
+        camera_to_world=Y_UP @ np.stack(room.poses) @ GL_TO_CV,
+        intrinsics=np.array([[160.0, 0, 128], [0, 160, 96], [0, 0, 1]]),
+        floor_m=np.array([(-3.0, -3), (3, -3), (3, 3.1), (-3, 3.1)]),
+    )
+    turn = turn_matrix(degrees)
+    turned = replace(
+        plain,
+        camera_to_world=turn @ plain.camera_to_world,
+        boxes={k: points @ turn[:3, :3].T for k, points in plain.boxes.items()},
+        floor_m=plain.floor_m @ turn[::2, ::2][:2, :2].T,
+    )
+    one, other = (prepare_room(RoomTask("a", "a", "train"), framed) for framed in (plain, turned))
+    assert one.views.turned_deg == 0 and one.views.room_from_world is None
+    views, truth = other.views, other.truth
+    assert abs((views.turned_deg + degrees + 45) % 90 - 45) < 0.5
+    assert f"turned by {views.turned_deg:.2f} degrees, along its walls" in other.notes[-1]
+    quarter = quarter_rotation(round((views.turned_deg + degrees) / 90))
+    slack = 0.05  # 0.5 degrees at 4 m
+    np.testing.assert_allclose(truth.centers_m, one.truth.centers_m @ quarter.T, atol=slack)
+    np.testing.assert_allclose(truth.sizes_m, one.truth.sizes_m @ abs(quarter).T, atol=slack)
+    level = quarter[::2, ::2]
+    np.testing.assert_allclose(truth.floor_m, one.truth.floor_m @ level.T, atol=slack)
+    mapped = views.room_from_world @ turned.camera_to_world
+    np.testing.assert_allclose(
+        mapped, np.linalg.inv(views.world_to_camera.astype(float)), atol=1e-5
+    )
+
+
+# -- What single data sets have --------------------------------------------------------------------
+
+
+def test_prefixed_attributes_and_numbers_of_rooms_are_read(room, tmp_path):
+    folder = tmp_path / "renders"
+    write_blenderproc(folder, "house", room)
+    for view in range(5):
+        with h5py.File(folder / "house" / f"{view}.hdf5", "r+") as file:
+            parts = json.loads(bytes(file["instance_attribute_maps"][()]))
+            old = [{k if k == "idx" else f"cp_{k}": x for k, x in part.items()} for part in parts]
+            del file["instance_attribute_maps"]
+            text = json.dumps([part | {"cp_room_id": 7} for part in old])
+            file["instance_attribute_maps"] = np.bytes_(text)
+    ((name, made),) = prepared("blenderproc", folder, recipe="all").items()
+    assert name == "house_7" and len(made.views.visible) == 5
+
+
+def test_rooms_of_other_types_are_left_out(room, tmp_path):
+    write_blenderproc(tmp_path, "house", room)
+    assert list(prepared("blenderproc", tmp_path, recipe="kitchen")) == ["house_Kitchen-2"]
+    with pytest.raises(InputError, match=r"No room of .* can be prepared"):
+        prepared("blenderproc", tmp_path, recipe="library")
+
+
+def test_a_truncated_frame_fails_its_house_by_name(room, tmp_path, cli):
+    for house in ("house", "other"):
+        write_blenderproc(tmp_path / "renders", house, room)
+    path = tmp_path / "renders/house/1.hdf5"
+    path.write_bytes(path.read_bytes()[:900])
+    out = tmp_path / "shards"
+    made = cli("prep-dataset", "blenderproc", tmp_path / "renders", "--out", out, "--workers", 1)
+    report = json.loads((out / "report.json").read_text())
+    assert report["statuses"]["prepared"] == 1 and made.exit_code == 3
+    (failed,) = report["failed"]
+    assert failed["room_id"] == "house" and "1.hdf5 cannot be read" in failed["reason"]
+
+
+def test_objects_without_a_box_leave_a_room_without_ground_truth(room, tmp_path):
+    write_hypersim(tmp_path, "ai_001_001", room, cam_from_uv(room))
+    path = next((tmp_path / "ai_001_001/_detail/mesh").glob("*positions*"))
+    with h5py.File(path, "r+") as file:
+        file["dataset"][300] = np.nan
+    (made,) = prepared("hypersim", tmp_path).values()
+    assert made.truth is None and made.notes[-1] == "1 of 2 objects have no 3D box: no ground truth"
+
+
+def test_a_room_of_walls_alone_shows_no_object(room, tmp_path):
+    room.things = room.things[2:]
+    write_hypersim(tmp_path, "ai_001_001", room, cam_from_uv(room))
+    (line,) = prepared("hypersim", tmp_path).values()
+    assert line.rule == "no_view" and line.reason == "none of its 4 views shows any object"
+
+
+def relabel(scene, **names):
+    path = scene / "scans/segments_anno.json"
+    groups = json.loads(path.read_text())["segGroups"]
+    for group in groups:
+        group["label"] = names.get(group["label"].replace(" ", "_"), group["label"])
+    path.write_text(json.dumps({"segGroups": groups}))
+
+
+def test_labels_of_scannetpp(room, tmp_path):
+    """ScanNet's table adds some; a scene without a floor stands on its lowest object."""
+    write_scannetpp(tmp_path, "0a5c01", room)
+    relabel(tmp_path / "0a5c01", office_chair="trash can", floor="unknown")
+    (made,) = prepared("scannetpp", tmp_path).values()
+    assert classes_of(made.views, NAMES) == ["bed"]
+    lows = made.truth.centers_m[:, 1] - made.truth.sizes_m[:, 1] / 2
+    assert lows.min() == pytest.approx(0, abs=1e-6)
+    table = [("raw_category", "nyu40class"), ("trash can", "bathtub")]
+    write_table(tmp_path / "scannetv2-labels.combined.tsv", table)
+    (made,) = prepared("scannetpp", tmp_path).values()
+    assert classes_of(made.views, NAMES) == ["bed", "bathtub"]
+    path = tmp_path / "0a5c01/dslr/nerfstudio/transforms.json"
+    data = json.loads(path.read_text())
+    data["frames"][2]["transform_matrix"] = np.full((4, 4), np.nan).tolist()
+    path.write_text(json.dumps(data))
+    (made,) = prepared("scannetpp", tmp_path).values()
+    assert len(made.views.visible) == 4
+    assert made.notes[0] == "1 of 5 frames have no usable pose; skipped"
+
+
+def test_a_floor_that_does_not_close_is_replaced_by_a_rectangle(room, tmp_path):
+    write_structured3d(tmp_path, "scene_00007", "480", room)
+    path = tmp_path / "scene_00007/annotation_3d.json"
+    data = json.loads(path.read_text())
+    data["planeLineMatrix"][0][0] = 0
+    path.write_text(json.dumps(data))
+    (made,) = prepared("structured3d", tmp_path).values()
+    np.testing.assert_allclose(np.ptp(made.truth.floor_m, axis=0), (1.7, 2.2), atol=1e-5)
+
+
+def one_by_one(instances, semantics):
+    """The rule as a loop: the most frequent class of each instance, the lowest id among equals."""
+    classes = {}
+    for instance in set(instances.ravel().tolist()) - {-1}:
+        own = [max(int(s), 0) for s in semantics[instances == instance]]
+        best = max(sorted(set(own)), key=own.count)
+        classes[instance + 1] = NYU40[best - 1] if best else "void"
+    ids, stuff = np.zeros_like(instances), np.zeros_like(instances)
+    for place in np.ndindex(instances.shape):
+        name = NYU40[semantics[place] - 1] if semantics[place] > 0 else ""
+        if instances[place] >= 0:
+            number = instances[place] + 1
+            ids[place] = 0 if classes[number] in SHELL else number
+        else:
+            ids[place] = 0 if name in SHELL else -1
+        stuff[place] = STUFF.index(name) if name in STUFF else 0
+    return ids, {k: name for k, name in classes.items() if name not in SHELL}, stuff
+
+
+def test_ids_and_classes_match_the_rule(numbers, tmp_path):
+    assert set(NAMES[1:]) < set(NYU40) and len(set(NYU40)) == 40 and set(NYU40) > SHELL
+    for _ in range(20):
+        instances = numbers.integers(-1, 6, (2, 5, 7))
+        semantics = numbers.choice([-1, 0, 1, 2, 5, 11, 20, 40], (2, 5, 7))
+        ids, classes, stuff = ids_and_classes(instances, semantics, "scene")
+        expected = one_by_one(instances, semantics)
+        np.testing.assert_array_equal(ids, expected[0])
+        assert classes == expected[1]
+        np.testing.assert_array_equal(stuff, expected[2])
+    with refused("readers/instance ids"):
+        ids_and_classes(np.full((1, 1), 70_000), np.zeros((1, 1), int), "scene")
+
+
+@pytest.mark.parametrize("shifts", [(0.0, 0.0), (0.3, 0.0), (-0.8, 0.0), (-0.07, -0.17)])
+def test_a_tilted_image_plane_is_that_of_a_turned_pinhole(room, numbers, shifts):
+    projection = 1.7 * cam_from_uv(room, *shifts)
+    intrinsics, turn = pinhole(projection, (96, 128))
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(turn) > 0 and np.abs(np.tril(intrinsics, -1)).max() < 1e-12
+    for u, v in numbers.uniform(-1, 1, (20, 2)):
+        ray = projection @ (u, v, 1) * (1, -1, -1)  # to OpenCV's axes
+        assert ray[2] > 0
+        x, y, w = intrinsics @ turn @ ray
+        np.testing.assert_allclose([x / w, y / w], [64 * (u + 1), 48 * (1 - v)], atol=1e-9)
+
+
+def test_a_skewed_grid_is_straightened_pixel_by_pixel():
+    K = np.array([[80.0, 9, 30], [0, 70, 21], [0, 0, 1]])
+    straight = K * (1 - np.eye(3)[0][:, None] * np.eye(3)[1])
+    lines = np.ix_(np.arange(40), np.arange(60))
+    (rows, columns), inside = straight_grid(lines, K, (40, 60))
+    for row, column in np.ndindex(40, 60):
+        x, y, _ = K @ np.linalg.solve(straight, (column + 0.5, row + 0.5, 1))
+        assert inside[row, column] == (0 <= x < 60)
+        if inside[row, column]:
+            assert (rows[row, column], columns[row, column]) == (int(y), int(x))
+    assert 0 < (~inside).sum() < 100
+    (_, same), all_of_it = straight_grid(lines, straight, (40, 60))
+    assert (same == np.arange(60)).all() and all_of_it.all()
+
+
+# -- Splits and selections -------------------------------------------------------------------------
+
+
+def test_rooms_are_selected_and_split_by_tables_names_and_seeds(room, tmp_path):
+    for k in range(4):
+        write_structured3d(tmp_path / "s3d", f"scene_0000{k}", "480", room)
+    folder, table = tmp_path / "s3d", tmp_path / "splits.csv"
+    one = open_reader("structured3d", folder, only="scene_00002/480")
+    assert [task.room_id for task in survey(one).rooms] == ["scene_00002_480"]
+    table.write_text("scene_00000,test\nscene_00001_480,val\nscene_00002,train\n")
+    found = survey(open_reader("structured3d", folder, splits=table))
+    assert [task.split for task in found.rooms] == ["test", "val", "train"]
+    assert [(line.room_id, line.rule) for line in found.left_out] == [("scene_00003_480", "split")]
+    table.write_text("scene_00000,test\n")
+    with refused("readers/no training room", tmp=tmp_path):
+        survey(open_reader("structured3d", folder, splits=table))
+    with refused("readers/no scene", tmp=tmp_path):
+        survey(open_reader("structured3d", folder, only="scene_9"))
+    other = furnished(tmp_path)
+    other.size = (96, 96)
+    write_structured3d(folder, "scene_00009", "481", other)
+    found = survey(open_reader("structured3d", folder))
+    (line,) = found.left_out
+    assert len(found.rooms) == 4 and line.rule == "image_size"
+    write_structured3d(tmp_path / "test", "scene_03400", "480", room)
+    with refused("readers/test scenes alone", tmp=tmp_path):
+        survey(open_reader("structured3d", tmp_path / "test"))
+    for k in range(4):
+        write_scannetpp(tmp_path / "pp", f"{k}a5c", room)
+    seeds = {tuple(splits_of(open_reader("scannetpp", tmp_path / "pp", seed=k))) for k in range(9)}
+    assert len(seeds) > 1
+    assert {tuple(sorted(splits)) for splits in seeds} == {("test", "train", "train", "train")}

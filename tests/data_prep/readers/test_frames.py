@@ -1,0 +1,139 @@
+"""Selection of the frames that become views, with poses and intrinsics."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from data_prep.readers.frames import (
+    choose_frames,
+    is_pose,
+    mask_intrinsics,
+    room_cameras,
+    sampled_lines,
+)
+from data_prep.readers.scannet import FULL_SIZE, QUARTER_SIZE
+from sceneprior.core.errors import InputError
+
+
+def still(count):
+    return np.repeat(np.eye(4, dtype=np.float32)[None], count, axis=0)
+
+
+def test_every_fifteenth_frame():
+    choice = choose_frames(still(100), range(100))
+    assert choice.frames == (0, 15, 30, 45, 60, 75, 90) and choice.candidates == 7
+    assert choice.bad_poses == choice.without_mask == 0
+
+
+def test_at_most_a_hundred_evenly():
+    choice = choose_frames(still(15 * 250), range(15 * 250))
+    steps = np.diff(choice.frames) // 15
+    assert len(choice.frames) == 100 and choice.candidates == 250
+    assert choice.frames[0] == 0 and choice.frames[-1] == 15 * 249
+    assert set(steps) == {2, 3}  # 249 steps of 15 in 99
+    assert len(choose_frames(still(1500), range(1500)).frames) == 100
+    assert choose_frames(still(1), [0], at_most=1).frames == (0,)
+    assert choose_frames(still(99), range(99), step=1, at_most=1).frames == (0,)
+
+
+def test_lost_poses_and_missing_masks_are_counted_and_make_room():
+    poses = still(60)
+    poses[[0, 20]] = -np.inf
+    poses[10, 1, 3] = np.nan
+    poses[11] = np.inf  # no candidate
+    choice = choose_frames(poses, {5, 15, 25, 30, 35, 40, 45, 50}, step=5, at_most=8)
+    assert choice.frames == (5, 15, 25, 30, 35, 40, 45, 50)
+    assert (choice.candidates, choice.bad_poses, choice.without_mask) == (12, 3, 1)  # 55
+
+
+def test_what_is_a_pose():
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.random(rng=0).as_matrix()
+    turn[:3, 3] = 100, -3, 5
+    rounded = turn.astype(np.float32)
+    mirrored, scaled, sheared, flat, homogeneous, huge, empty = (turn.copy() for _ in range(7))
+    mirrored[:3, 0] *= -1
+    scaled[:3, :3] *= 1.02
+    sheared[:3, 0] += 0.02
+    flat[:3, 2] = 0
+    homogeneous[3] = 1, 0, 0, 1
+    huge[:3, :3] = 1e38
+    empty[:] = 0
+    bad = [mirrored, scaled, sheared, flat, homogeneous, huge, empty]
+    assert is_pose(np.stack([turn, rounded, *bad])).tolist() == [True, True, *[False] * 7]
+
+
+def test_a_room_camera_undoes_pose_and_frame(rng):
+    frame = np.eye(4)
+    frame[:3, :3] = Rotation.random(rng=1).as_matrix()
+    frame[:3, 3] = 4, 5, 6
+    poses = still(5).astype(np.float64)
+    poses[:, :3, :3] = Rotation.random(5, rng=2).as_matrix()
+    poses[:, :3, 3] = rng.normal(size=(5, 3))
+    cameras = room_cameras(poses, frame)
+    # Double rounding alone: these rotations are exact.
+    np.testing.assert_allclose(
+        cameras @ frame @ poses, np.broadcast_to(np.eye(4), (5, 4, 4)), atol=1e-14
+    )
+    points = rng.normal(size=(3, 7))
+    world = frame[:3, :3] @ (poses[0, :3, :3] @ points + poses[0, :3, 3:]) + frame[:3, 3:]
+    np.testing.assert_allclose(cameras[0, :3, :3] @ world + cameras[0, :3, 3:], points, atol=1e-13)
+    # A pose that is off by a rounding is made rigid, its camera left where it stands.
+    tilted = poses.copy()
+    tilted[:, :3, :3] += rng.normal(scale=1e-3, size=(5, 3, 3))
+    cameras = room_cameras(tilted, frame)
+    turn = cameras[:, :3, :3]
+    np.testing.assert_allclose(turn @ turn.transpose(0, 2, 1), still(5)[:, :3, :3], atol=1e-14)
+    centres = -(turn.transpose(0, 2, 1) @ cameras[:, :3, 3:])[..., 0]
+    np.testing.assert_allclose(
+        centres, tilted[:, :3, 3] @ frame[:3, :3].T + frame[:3, 3], atol=1e-13
+    )
+
+
+K = np.array([[1170.0, 0.5, 640.75], [0, 1165, 491.25], [0, 0, 1]])
+
+
+@pytest.mark.parametrize("image_size", [QUARTER_SIZE, FULL_SIZE, (484, 648), (88, 432)])
+def test_a_sampled_pixel_is_where_the_lens_says(image_size):
+    """By whole steps: the ray through a kept pixel's centre meets the small pixel's centre."""
+    lens = mask_intrinsics(K, FULL_SIZE, FULL_SIZE, image_size)
+    rows, columns = (sampled_lines(*pair) for pair in zip(FULL_SIZE, image_size, strict=True))
+    assert len(np.unique(rows)) == image_size[0] and rows[-1] < 968 and columns[-1] < 1296
+    for i, j in ((0, 0), (7, 50), (image_size[0] - 1, image_size[1] - 1)):
+        ray = np.linalg.inv(K) @ (columns[j] + 0.5, rows[i] + 0.5, 1)
+        # Only rounding: numbers of the size of a pixel coordinate.
+        np.testing.assert_allclose(lens @ ray, (j + 0.5, i + 0.5, 1), atol=1e-10)
+
+
+def test_masks_of_another_size_show_the_same_picture():
+    """640 x 480 masks of 1296 x 968 colour: the corners stay corners, whatever is stored."""
+    for image_size in ((480, 640), QUARTER_SIZE, FULL_SIZE):
+        lens = mask_intrinsics(K, FULL_SIZE, (480, 640), image_size)
+        rows, columns = (sampled_lines(*pair) for pair in zip((480, 640), image_size, strict=True))
+        rays = np.linalg.inv(K) @ np.stack(
+            [
+                (columns[: len(rows)] + 0.5) / 640 * 1296,
+                (rows[: len(columns)] + 0.5) / 480 * 968,
+                np.ones(len(rows)),
+            ]
+        )
+        u, v, _ = lens @ rays - (np.arange(len(rows)) + 0.5)
+        # Uneven steps cannot all be met: none is off by more than 3/4 of a mask pixel.
+        step = np.array([640 / image_size[1], 480 / image_size[0]])
+        assert (np.abs([u, v]).max(axis=1) <= 0.75 / step).all()
+        if image_size == (480, 640):
+            assert np.abs([u, v]).max() < 1e-10
+
+
+def test_masks_of_another_shape_are_refused():
+    with pytest.raises(
+        InputError, match="masks are 484 x 484 pixels but the colour frames 1296 x 968"
+    ):
+        mask_intrinsics(K, FULL_SIZE, (484, 484), QUARTER_SIZE)
+
+
+def test_lines_are_sampled_as_shards_sample_them():
+    """`Shard.read_instance_ids(step=4)` of a full-size shard and a quarter-size shard agree."""
+    np.testing.assert_array_equal(sampled_lines(968, 242), np.arange(968)[2::4])
+    np.testing.assert_array_equal(sampled_lines(7, 7), np.arange(7))
+    assert sampled_lines(3, 6).tolist() == [0, 0, 1, 1, 2, 2]

@@ -1,0 +1,253 @@
+"""Masks and poses of every tool: what is read beside the room, guessed, joined and left out."""
+
+import json
+
+import capture_files as tools
+import numpy as np
+import pytest
+from capture_files import SEGMENTS, same_masks, same_objects
+from colmap_files import write_colmap
+from PIL import Image
+from posed_files import SET, PosedRoom, furniture, prepared
+from refusals import refused
+
+from data_prep.readers.posed.formats import MASKS, Formats, read_formats, read_label_set
+from data_prep.readers.posed.pngs import find_table
+from data_prep.readers.posed.reader import Posed
+from data_prep.readers.posed.transforms import POSES, read_recording
+from sceneprior.core.classes import STUFF
+from sceneprior.core.id_tables import read_class_table
+
+UNTRACKED = {"coco": tools.write_coco_images, "grounded-sam2": tools.write_grounded_sam2_images}
+TRACKED = {
+    "sam2": tools.write_sam2,
+    "sam2, without masks of what is hidden": lambda room: tools.write_sam2(room, hidden=False),
+    "sam2 in masks": lambda room: tools.write_sam2(room, "masks"),
+    "grounded-sam2": tools.write_grounded_sam2,
+    "coco track_id": lambda room: tools.write_coco_images(room, "track_id"),
+    "coco instance_id": lambda room: tools.write_coco_images(
+        room, "instance_id", "annotations/instances_default.json"
+    ),
+    "coco video": tools.write_coco_video,
+}
+
+
+@pytest.mark.parametrize("tool", TRACKED)
+def test_tracked_masks_are_those_of_pngs(room, plain, tool):
+    TRACKED[tool](room)
+    made = prepared(room)
+    same_masks(made.views, plain.views)
+    name = tool.split()[0].strip(",")
+    assert prepared(room, tools=["nerfstudio", name]).notes == made.notes == plain.notes
+
+
+@pytest.mark.parametrize("tool", UNTRACKED)
+def test_ids_of_single_images_are_joined_without_being_asked(room, plain, tool):
+    UNTRACKED[tool](room)
+    same_objects(prepared(room).views, plain.views)
+    (said,) = (s for s in Posed(room.folder, classes=SET).assumptions() if "--tracks" in s)
+    assert said.startswith("In 1 of 1 rooms ids belong to single images (")
+    assert said.endswith("objects are found from poses, masks and classes, as with --tracks auto.")
+
+
+def shuffle(room, unique):
+    """Give each frame ids of its own, and write their classes as `unique` ids of the room, or in a
+    JSON beside each PNG."""
+    names = {thing.id: thing.name for thing in room.things}
+    table, first = {}, 1
+    for view in range(len(room.poses)):
+        old = room.ids(view)
+        new = np.zeros_like(old)
+        own = {}
+        for k in np.unique(old[old > 0])[:: 1 - 2 * (view % 2)].tolist():
+            new[old == k] = first
+            own[str(first)] = names[k]
+            first += 1
+        Image.fromarray(new).save(room.png(view))
+        table |= own
+        if not unique:
+            first = 1
+            room.png(view).with_suffix(".json").write_text(json.dumps(own))
+    (room.folder / "classes.json").unlink()
+    if unique:
+        (room.folder / "classes.json").write_text(json.dumps(table))
+
+
+@pytest.mark.parametrize("unique", [True, False])
+def test_ids_of_single_frames_are_joined(room, plain, unique, tmp_path):
+    shuffle(room, unique)
+    same_objects(prepared(room, tracks="auto").views, plain.views)
+    if unique:
+        with refused("readers/ids of single frames", tmp=tmp_path):
+            prepared(room)
+        return
+    room.png(3).with_suffix(".json").unlink()
+    with refused("readers/frame without classes", tmp=tmp_path):
+        prepared(room, tracks="auto")
+    room.png(3).with_suffix(".json").write_text(json.dumps({"1": "bed"}))
+    notes = prepared(room, tracks="auto").notes
+    assert any("masks have no class in their frame's table: void" in note for note in notes)
+
+
+def test_right_ids_stay_and_a_broken_track_is_mended(room, plain):
+    same_objects(prepared(room, tracks="auto").views, plain.views)
+    # The bed has another id from the fifth frame on.
+    names = json.loads((room.folder / "classes.json").read_text())
+    (room.folder / "classes.json").write_text(json.dumps(names | {"4": "bed"}))
+    for view in range(5, 10):
+        ids = room.ids(view)
+        ids[ids == 3] = 4
+        Image.fromarray(ids).save(room.png(view))
+    assert len(prepared(room).views.object_class) == 3
+    same_objects(prepared(room, tracks="auto").views, plain.views)
+
+
+def test_masks_that_overlap_show_the_smaller_one(room, plain):
+    """SAM 2's masks may overlap; those of a whole bed, say, with the chair that hides a part."""
+    tools.write_sam2(room)
+    assert (plain.views.instance_ids == 2).any()
+    for view in range(len(room.poses)):
+        whole = np.isin(room.ids(view), (3, 300)).astype(np.uint8)
+        Image.fromarray(whole).save(room.folder / "003" / f"{room.stem(view)}.png")
+    same_masks(prepared(room).views, plain.views)
+
+
+def test_an_id_takes_its_most_frequent_class(room, plain):
+    tools.write_grounded_sam2(room)
+    path = room.folder / "json_data/mask_frame_00004.json"
+    path.write_text(path.read_text().replace('"bed"', '"sofa"'))
+    made = prepared(room)
+    same_masks(made.views, plain.views)
+    note = "ids with several classes take the most frequent one: 3 (bed 9, sofa 1)"
+    assert note in made.notes
+
+
+def test_panoptic_masks_are_tracks_with_stuff(room, plain):
+    def rename(data):
+        data["categories"].append({"id": 190, "name": "floor-other-merged", "isthing": 0})
+        for segment in data["annotations"][1]["segments_info"]:
+            if segment["id"] == SEGMENTS[11]:
+                segment["category_id"] = 190
+
+    tools.write_panoptic(room)
+    made = prepared(room)
+    # Numbered by their ids, so the chair (5) comes before the bed (70,001); a wall is no object.
+    assert made.views.object_class.tolist() == [2, 1] and plain.views.object_class.tolist() == [
+        1,
+        2,
+    ]
+    swapped = np.array([0, 2, 1, 3])[made.views.instance_ids]
+    np.testing.assert_array_equal(swapped[swapped < 3], plain.views.instance_ids[swapped < 3])
+    is_wall = np.stack([room.ids(view) for view in range(len(room.poses))]) == 11
+    np.testing.assert_array_equal(made.views.stuff, STUFF.index("wall") * is_wall)
+    tools.write_panoptic(room, rename)  # a segment of stuff with several classes is background
+    assert prepared(room).views.stuff is None
+
+
+def test_crowds_and_ids_without_a_segment_are_void(room):
+    def crowd(data):
+        for frame in data["annotations"]:
+            for segment in frame["segments_info"]:
+                segment["iscrowd"] = int(segment["id"] == 5)
+            frame["segments_info"] = [s for s in frame["segments_info"] if s["id"] != 256]
+
+    tools.write_panoptic(room, crowd)
+    made = prepared(room)
+    assert made.views.object_class.tolist() == [1]
+    assert "classes outside the label set are void: backpack (1), crowd (1)" in made.notes
+    assert any("masks show ids that the table of classes does not have" in n for n in made.notes)
+
+
+@pytest.mark.parametrize("folder", ["corrected_cameras", "cameras"])
+def test_polycam(room, plain, folder):
+    tools.write_polycam(room, folder)
+    made = prepared(room)
+    np.testing.assert_array_equal(made.views.world_to_camera, plain.views.world_to_camera)
+    np.testing.assert_array_equal(made.views.intrinsics, plain.views.intrinsics)
+    same_masks(made.views, plain.views)
+    recording = read_recording(room.folder)
+    assert recording.metres_per_unit == 1.0 and recording.up == "y"
+    pictures = folder.replace("cameras", "images")
+    assert recording.frames[0].name == f"keyframes/{pictures}/{tools.timestamp(0)}.jpg"
+    if folder == "corrected_cameras":  # they are preferred
+        room.focal_px = 70.0
+        tools.write_polycam(room, "cameras")
+        assert {frame.camera.fl_x for frame in read_recording(room.folder).frames} == {80.0}
+
+
+@pytest.mark.parametrize("name", ["metadata", "metadata.json", "EXR_RGBD/metadata"])
+def test_record3d(room, plain, name):
+    tools.write_record3d(room, name)
+    made = prepared(room, up="y")
+    # A rotation is a quaternion there, which rounds.
+    np.testing.assert_allclose(made.views.world_to_camera, plain.views.world_to_camera, atol=1e-6)
+    np.testing.assert_array_equal(made.views.intrinsics, plain.views.intrinsics)
+    same_masks(made.views, plain.views)
+    (room.folder / "transforms.json").write_text('{"floor_m": 0.0}')
+    # Nothing says which axis is up; the cameras do not roll.
+    upright = np.linalg.inv(prepared(room).views.world_to_camera.astype(float))
+    np.testing.assert_allclose(upright[:, 1, 3], [pose[2, 3] for pose in room.poses], atol=1e-5)
+
+
+def test_each_frame_of_record3d_has_its_principal_point_and_may_be_lost(room):
+    tools.write_record3d(room, per_frame=True)
+    made = prepared(room, up="y").views
+    np.testing.assert_array_equal(made.intrinsics[:, 0, 2], 64.0 + np.arange(10))
+    data = json.loads((room.folder / "metadata").read_text())
+    data["poses"][2] = [0.0] * 7
+    data["poses"][3][4] = float("nan")
+    (room.folder / "metadata").write_text(json.dumps(data))
+    assert prepared(room, up="y").notes[0] == "2 of 10 frames have no usable pose; skipped"
+
+
+def test_a_colmap_model_beside_transforms_is_taken_if_named(room, plain):
+    write_colmap(room, "PINHOLE", binary=True, folder="colmap/sparse/0")
+    assert len(read_recording(room.folder).frames) == 10
+    room.write_transforms(room.data | {"floor_m": 0.0, "floor_center_m": [0.1, -0.2]})
+    np.testing.assert_array_equal(prepared(room).views.world_to_camera, plain.views.world_to_camera)
+    assert read_recording(room.folder).up == "z"
+    assert read_recording(room.folder, "colmap").up == "cameras"
+
+
+def test_what_was_found_is_said(room, cli, tmp_path):
+    other = PosedRoom(room.folder.parent / "cellar", furniture(0.1)).write(floor_m=0.0)
+    tools.write_sam2(room)
+    assert Posed(room.folder.parent, classes=SET).found() == [
+        "1 room with poses of nerfstudio (transforms.json) and masks of SAM 2 (a folder per "
+        "object), as with --from nerfstudio --from sam2.",
+        "1 room with poses of nerfstudio (transforms.json) and masks of PNGs of ids (instances/), "
+        "as with --from nerfstudio --from png.",
+    ]
+    both = read_formats(["png", "nerfstudio"])
+    assert Posed(other.folder, classes=SET, formats=both).found() == []
+    # A room without the masks that were asked for is in the report, and the other is prepared.
+    result = cli("prep-posed", room.folder.parent, "--label-set", SET, "--test-share", 0,
+                 "--from", "sam2", "--out", tmp_path / "b", "--workers", 1)  # fmt: skip
+    assert result.exit_code == 3 and result.stderr.startswith("Found 1 room with"), result.output
+    assert "leave out --from sam2 to guess." in (tmp_path / "b" / "report.csv").read_text()
+
+
+def test_names_of_tools():
+    assert read_formats([]) == read_formats(()) == Formats()
+    for name in (*POSES, *MASKS):
+        assert name in vars(read_formats([name])).values()
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("classes.json", '{"1": "bed", " 300 ": "night stand"}'),
+        ("classes.csv", "id,class\n1,bed\n\n300,night stand\n"),
+        ("classes.csv", "\ufeff1,bed,note\n 300 ,night stand"),
+    ],
+)
+def test_tables_and_label_sets(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    assert read_class_table(find_table(tmp_path)) == {1: "bed", 300: "night stand"}
+    assert read_label_set("scannet") == "scannet"
+    assert read_label_set("void, bed,night stand") == "void,bed,night stand"
+    path = tmp_path / "set.txt"
+    path.write_text("# mine\nvoid\nbed\n\n night stand \n")
+    assert read_label_set(str(path)) == "void,bed,night stand"
+    (tmp_path / "set.json").write_text('["bed", "chair"]')
+    assert read_label_set(str(tmp_path / "set.json")) == SET

@@ -1,0 +1,483 @@
+"""Posed rooms to views: every box where the picture says, whatever the axes, units and lenses."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from colmap_files import SCALE, write_colmap
+from PIL import Image
+from posed_files import SET, PosedRoom, Thing, furniture, in_room, overlaps, prepared
+from scipy.spatial.transform import Rotation
+from tiny_runs import tiny_config
+
+from data_prep.engine.build import Job, build_shards
+from data_prep.engine.source import RoomTask
+from data_prep.engine.workers import pool
+from data_prep.inspection.checks import array_problems, mask_problems
+from data_prep.readers.posed.cameras import seems_up
+from data_prep.readers.posed.reader import Posed, find_rooms
+from data_prep.readers.posed.recording import frame_intrinsics, room_name
+from data_prep.readers.posed.transforms import read_recording
+from sceneprior.core.boxes import quarter_rotation, yaw_rotation
+from sceneprior.core.classes import label_set
+from sceneprior.core.dataset import ViewDataset
+from sceneprior.core.errors import InputError
+from sceneprior.core.ground_truth import reference_scenes
+
+KEYS = {"floor_m": 0.0, "floor_center_m": [0.1, -0.2]}
+LENSES = {
+    "OPENCV": {"k1": -0.2, "k2": 0.05, "p1": 0.001, "p2": -0.002},
+    "OPENCV_FISHEYE": {"k1": 0.05, "k2": -0.01, "k3": 0.002, "k4": 0.0},
+}
+Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+
+
+@pytest.fixture
+def room(tmp_path):
+    return PosedRoom(tmp_path / "room")
+
+
+def check(views):
+    assert not [*array_problems(views, len(label_set(SET))), *mask_problems(views)]
+
+
+def eyes_of(views):
+    return np.linalg.inv(views.world_to_camera.astype(float))[:, :3, 3]
+
+
+def test_things_are_where_their_masks_are(room):
+    made = prepared(room.write(**KEYS))
+    views = made.views
+    check(views)
+    assert views.object_class.tolist() == [1, 2] and made.truth is None
+    assert views.room_id == "room" and views.image_size == (96, 128)
+    assert made.notes == ("classes outside the label set are void: backpack (1)",)
+    iou = overlaps(views, in_room(room))
+    assert len(iou) >= 2 and iou.min() > 0.95  # some 30 pixels wide, half a pixel a side
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_units_and_axes_are_those_of_the_settings(room, up):
+    """The same room in feet, or with y up, is the same room."""
+    plain = prepared(room.write(**KEYS)).views
+    data = room.data
+    for frame, pose in zip(data["frames"], room.poses, strict=True):
+        pose = pose.copy()
+        pose[:3, 3] /= 0.3048
+        pose = Y_UP @ pose if up == "y" else pose
+        frame["transform_matrix"] = pose[:3].tolist()  # a last row may be left out
+    keys = {"floor_m": 0.0, "floor_center_m": [0.1, -0.2 if up == "z" else 0.2]}
+    room.write_transforms(data | keys)
+    turned = prepared(room, up=up, metres_per_unit=0.3048).views
+    np.testing.assert_allclose(turned.world_to_camera, plain.world_to_camera, atol=1e-6)
+    room.write_transforms(data | keys | {"metres_per_unit": 0.3048})
+    same = prepared(room, up=up, metres_per_unit=9.0).views  # the file wins
+    np.testing.assert_array_equal(same.world_to_camera, turned.world_to_camera)
+    assert seems_up(read_recording(room.folder)) == up
+
+
+def test_an_unknown_floor_is_an_assumption_that_is_said(room):
+    room.poses = room.poses[:2]  # too few to find it
+    made = prepared(room.write(), camera_height_m=1.3)
+    why = "too few pieces show where they end"
+    assert made.notes[-1] == f"the floor is assumed 1.3 m below the lowest camera ({why})"
+    eyes = eyes_of(made.views)
+    np.testing.assert_allclose(eyes[:, 1].min(), 1.3, atol=1e-5)  # float32 poses of metres
+    middle = (eyes.min(axis=0) + eyes.max(axis=0))[[0, 2]] / 2
+    np.testing.assert_allclose(middle, 0, atol=1e-5)
+    told = prepared(room, floor_m=-0.1)
+    np.testing.assert_allclose(eyes_of(told.views)[:, 1].min(), 1.6, atol=1e-5)
+    assert not any("assumed" in note for note in told.notes)
+
+
+@pytest.mark.parametrize("lift", [0.0, -3.0])
+def test_pieces_on_the_floor_find_it_whatever_hangs_or_lies_on_them(room, lift):
+    classes = "void,bed,chair,lamp,book"
+    room.size, room.focal_px = (240, 320), 200.0
+    room.look((1.0, 2.4, 1.6), (0.1, 0.1, 0.3))
+    room.look((-2.4, 0.3, 1.8), (0.1, 0.1, 0.3))
+    room.things += [
+        Thing(20, "lamp", (0.2, -0.2, 1.7), (0.5, 0.1, 2.0)),
+        Thing(21, "book", (-0.4, -0.4, 0.5), (-0.1, -0.1, 0.6)),
+        Thing(22, "chair", (-1.3, 0.3, 0.0), (-0.9, 0.7, 0.8)),
+    ]
+    for thing in room.things:
+        thing.low = (*thing.low[:2], thing.low[2] + lift)
+        thing.high = (*thing.high[:2], thing.high[2] + lift)
+    for pose in room.poses:
+        pose[2, 3] += lift
+    made = prepared(room.write(), classes, camera_height_m=9.0)
+    assert abs(eyes_of(made.views)[:, 1].min() - 1.5) < 0.03
+    (said,) = (note for note in made.notes if "the floor" in note)
+    assert said.startswith("the floor is found where ") and said.endswith("below the lowest camera")
+    room.poses = []  # a camera that only turns does not tell
+    for step in (-0.2, 0.0, 0.2, 0.4):
+        room.look((2.0, -2.0, 1.5 + lift), (0.1 + step, 0.1, 0.3 + lift))
+    assert "assumed" in prepared(room.write(), classes).notes[-1]
+
+
+def test_smaller_masks_keep_their_lens(room):
+    """Sampled down to any size, things stay where they are; so do masks smaller than pictures."""
+    room.size, room.focal_px = (480, 640), 400.0
+    room.write(**KEYS)
+    for max_side, size in ((None, (480, 640)), (160, (120, 160)), (150, (112, 150))):
+        views = prepared(room, max_side=max_side).views
+        assert views.image_size == size
+        check(views)
+        assert overlaps(views, in_room(room)).mean() > 0.95
+    small = PosedRoom(room.folder, size=(120, 160), focal_px=100.0)
+    for view in range(5):
+        Image.fromarray(small.ids(view)).save(room.png(view))
+    views = prepared(room).views
+    np.testing.assert_allclose(views.intrinsics[0, 0], [100, 0, 80], atol=1e-4)
+    assert overlaps(views, in_room(room)).mean() > 0.95
+
+
+def test_a_focal_length_may_be_an_angle_and_a_frames_own(room):
+    gone = dict.fromkeys(("fl_x", "fl_y", "cx", "cy", "w", "h"))
+    views = prepared(room.write(camera_angle_x=float(2 * np.arctan(64 / 80)), **gone)).views
+    np.testing.assert_allclose(
+        views.intrinsics[0], [[80, 0, 64], [0, 80, 48], [0, 0, 1]], atol=1e-4
+    )
+    data = room.data
+    data["frames"][2]["fl_x"] = 77.0
+    room.write_transforms(data)
+    assert prepared(room).views.intrinsics[:, 0, 0].tolist() == [80, 80, 77, 80, 80]
+
+
+def test_frames_poses_and_their_files(room, tmp_path, monkeypatch):
+    data = room.data
+    data["frames"][1] |= {"file_path": "./train/r_1", "mask_path": "known.png"}
+    data["frames"][2] |= {"file_path": "video/frame.0002.PNG"}
+    data["frames"][3] |= {"instance_path": "elsewhere/3.png"}
+    room.folder.mkdir()
+    room.write_transforms(data | {"floor_m": -1, "floor_center_m": [1, 2.5]})
+    recording = read_recording(room.folder)
+    inside = [str(frame.instances.relative_to(room.folder)) for frame in recording.frames]
+    assert inside == [
+        "instances/frame_00000.png", "instances/r_1.png", "instances/frame.0002.png",
+        "elsewhere/3.png", "instances/frame_00004.png",
+    ]  # fmt: skip
+    assert recording.frames[1].known == room.folder / "known.png"
+    assert recording.frames[0].known is None
+    np.testing.assert_array_equal(recording.frames[4].camera_to_world, room.poses[4])
+    assert (recording.floor_m, recording.floor_center_m) == (-1.0, (1.0, 2.5))
+    assert recording.metres_per_unit is None
+    K, size = frame_intrinsics(recording.frames[0], (1, 1))
+    assert K.tolist() == [[80, 0, 64], [0, 80, 48], [0, 0, 1]] and size == (96, 128)
+    monkeypatch.chdir(tmp_path)
+    assert room_name(tmp_path / "a") == "a" and room_name(".") == tmp_path.name
+
+
+def test_split_files_are_one_room_and_frames_may_lie_in_folders(room):
+    whole = prepared(room.write(**KEYS)).views
+    data = room.data
+    for k, frame in enumerate(data["frames"]):
+        frame["file_path"] = f"./{'train' if k < 3 else 'test'}/r_{k % 3}"
+        path = room.folder / "instances" / f"{frame['file_path']}.png"
+        path.parent.mkdir(exist_ok=True)
+        room.png(k).rename(path)
+    (room.folder / "transforms.json").unlink()
+    for split, part in (("train", slice(0, 2)), ("val", slice(2, 3)), ("test", slice(3, 5))):
+        own = {**data, "frames": data["frames"][part]}
+        if split != "train":  # each file has a camera of its own, and the room's keys once
+            own |= KEYS
+        (room.folder / f"transforms_{split}.json").write_text(json.dumps(own))
+    order = [3, 4, 0, 1, 2]  # by the files' names: test, train, val
+    parts = prepared(room).views
+    np.testing.assert_array_equal(parts.world_to_camera, whole.world_to_camera[order])
+    np.testing.assert_array_equal(parts.instance_ids, whole.instance_ids[order])
+
+
+def test_frames_that_cannot_be_used_are_counted(room):
+    for k in range(6):
+        room.look((2 - 0.1 * k, -1.5, 1.5), (0, 0, 0.3))
+    room.write()
+    data = room.data
+    data["frames"][1]["transform_matrix"][0][3] = float("nan")
+    room.write_transforms(data)
+    room.png(3).unlink()
+    made = prepared(room)
+    assert len(made.views.visible) == 9
+    assert made.notes[:2] == (
+        "1 of 11 frames have no usable pose; skipped", "1 of 11 frames have no mask; skipped",
+    )  # fmt: skip
+    assert len(prepared(room, max_views=4).views.visible) == 4
+    room.poses = [np.full((4, 4), np.nan)]
+    assert seems_up(read_recording(room.write().folder)) is None
+
+
+def test_what_hides_and_what_does_not(room):
+    """Void things and unknown pixels take away the clearness of a side; walls do not."""
+    room.things = room.things[:1]
+    room.write()
+    base = room.ids(0)
+    rows, columns = np.nonzero(base)
+    left = (slice(rows.min(), rows.max() + 1), slice(columns.min() - 9, columns.min()))
+    assert prepared(room).views.sides_clear[0, 0].all()
+    beside = base.copy()
+    beside[left] = 9
+    Image.fromarray(beside).save(room.png(0))
+    unlisted = prepared(room)
+    assert unlisted.views.sides_clear[0, 0].tolist() == [False, True, True, True]
+    assert "the table of classes does not have (9): void" in " ".join(unlisted.notes)
+    np.testing.assert_array_equal(unlisted.views.instance_ids[0] == 2, beside == 9)
+    (room.folder / "classes.json").write_text('{"3": "bed", "9": "backpack"}')
+    assert not prepared(room).views.sides_clear[0, 0].all()
+    (room.folder / "classes.json").write_text('{"3": "bed", "9": "Wall"}')
+    assert prepared(room).views.sides_clear[0, 0].all()
+    assert prepared(room).views.instance_ids.max() == 1
+    Image.fromarray(base).save(room.png(0))
+    known = np.full(room.size, 255, dtype=np.uint8)
+    known[left] = 0
+    Image.fromarray(known).save(room.folder / "known.png")
+    data = room.data
+    data["frames"][0]["mask_path"] = "known.png"
+    room.write_transforms(data)
+    masked = prepared(room).views
+    assert masked.sides_clear[0, 0].tolist() == [False, True, True, True]
+    np.testing.assert_array_equal(masked.instance_ids[0] == 2, known == 0)
+    check(masked)
+
+
+@pytest.mark.parametrize("degrees", [33.0, -57.0, 123.0])
+@pytest.mark.parametrize("keys", [{}, {"floor_m": 0.0, "floor_center_m": (0.1, -0.2)}])
+def test_a_capture_with_any_heading_is_the_same_room(room, degrees, keys):
+    """The world of the poses is turned about its z axis: the room is the same, up to quarters."""
+    for eye in [(-2.5, 0.1, 1.5), (2.5, 0.3, 1.6), (0.1, 2.6, 1.4), (1.6, -2.4, 1.7)]:
+        room.look(eye, (0.1, 0.1, 0.3))
+    room.size, room.focal_px = (192, 256), 160.0
+    plain = prepared(room.write(**keys))
+    assert plain.views.turned_deg == 0 and plain.views.room_from_world is None
+    assert not any("turned" in note for note in plain.notes)
+    exact = np.array(plain.cameras["room_from_world"])[:3, :3]
+    assert np.isin(exact, (0, 1, -1)).all()  # not even by last bits
+    turn = np.eye(4)
+    turn[:2, :2] = yaw_rotation(np.radians(degrees))[::2, ::2]
+    room.poses = [turn @ pose for pose in room.poses]
+    if "floor_center_m" in keys:
+        center = turn[:2, :2] @ keys["floor_center_m"]
+        keys = keys | {"floor_center_m": center.tolist()}
+    room.write_transforms(room.data | keys)  # the masks are those of before
+    made = prepared(room)
+    views = made.views
+    assert -45 <= views.turned_deg <= 45 and abs(views.turned_deg) > 1
+    assert f"turned by {views.turned_deg:.2f} degrees, along its walls" in " ".join(made.notes)
+    np.testing.assert_array_equal(views.instance_ids, plain.views.instance_ids)
+    np.testing.assert_allclose(views.room_from_world, made.cameras["room_from_world"], atol=1e-8)
+    # The file's poses, mapped by the shard's matrix, are the room's cameras.
+    mapped = views.room_from_world @ np.array(room.poses) @ np.diag([1.0, -1, -1, 1])
+    here = np.linalg.inv(views.world_to_camera.astype(float))
+    np.testing.assert_allclose(mapped, here, atol=1e-5)
+    there = eyes_of(plain.views)
+    apart = [np.abs(here[:, :3, 3] - there @ quarter_rotation(k).T).max() for k in range(4)]
+    # 0.3 degrees at 3 m; and the middle of the cameras' bounding box moves a little, too.
+    assert min(apart) < 0.03
+
+
+def distorted_ids(room, view, model, keys):
+    """The picture through a lens: OpenCV finds the ray of each pixel, and a wide pinhole picture
+    gives the value on that ray."""
+    wide = PosedRoom(room.folder, room.things, (1200, 1600), 400.0, list(room.poses))
+    height, width = room.size
+    v, u = np.indices(room.size) + 0.5
+    points = np.stack([u - width / 2, v - height / 2], axis=-1).reshape(-1, 1, 2) / room.focal_px
+    if model == "OPENCV":
+        bent = np.array([keys["k1"], keys["k2"], keys["p1"], keys["p2"]])
+        rays = cv2.undistortPoints(points, np.eye(3), bent)
+    else:
+        bent = np.array([keys[f"k{i}"] for i in range(1, 5)])
+        rays = cv2.fisheye.undistortPoints(points, np.eye(3), bent)
+    places = np.floor(rays.reshape(-1, 2) * 400 + [800, 600]).astype(int)
+    assert (places >= 0).all() and (places < [1600, 1200]).all()
+    return wide.ids(view)[places[:, 1], places[:, 0]].reshape(room.size)
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_things_are_where_they_are_through_a_distorted_lens(room, model):
+    room.size, room.focal_px = (240, 320), 180.0
+    room.write(camera_model=model, **LENSES[model], **KEYS)
+    pictures = [distorted_ids(room, k, model, LENSES[model]) for k in range(len(room.poses))]
+    for view, ids in enumerate(pictures):
+        Image.fromarray(ids).save(room.png(view))
+    made = prepared(room)
+    # Half a pixel a side of the source, stretched to one at the rim: of things from 40 px on.
+    assert len(found := overlaps(made.views, in_room(room))) >= 2 and found.min() > 0.94
+    assert any(
+        note.startswith(f"the lens {model} ") and "of its pictures is cut away" in note
+        for note in made.notes
+    )
+    room.write_transforms(room.data | KEYS)  # as if the lens were straight
+    assert overlaps(prepared(room).views, in_room(room)).mean() < found.mean() - 0.03
+    # The same as a model of COLMAP; a transforms.json without frames has keys about the room.
+    write_colmap(room, model, binary=True)
+    for view, ids in enumerate(pictures):
+        Image.fromarray(ids).save(room.png(view))
+    said = {"metres_per_unit": 1 / SCALE, "floor_m": 0.0}
+    (room.folder / "transforms.json").write_text(json.dumps(said))
+    views = prepared(room).views
+    eyes, true = eyes_of(views), np.array([pose[:3, 3] for pose in room.poses])
+    np.testing.assert_allclose(eyes[:, 1], true[:, 2], atol=1e-4)
+    turn, _ = Rotation.align_vectors(eyes - eyes.mean(axis=0), true - true.mean(axis=0))
+    corners = [turn.apply(thing.corners - true.mean(axis=0)) + eyes.mean(axis=0)
+               for thing in room.things[:2]]  # fmt: skip
+    assert overlaps(views, corners).min() > 0.94
+
+
+@pytest.mark.parametrize("binary", [True, False])
+@pytest.mark.parametrize("model", ["SIMPLE_PINHOLE", "PINHOLE"])
+def test_a_colmap_model_is_the_room_it_was_made_of(room, model, binary):
+    room.size, room.focal_px = (240, 320), 180.0
+    room.things.append(Thing(8, "chair", (-1.3, 0.5, 0.0), (-0.9, 0.9, 0.8)))
+    plain = prepared(room.write(floor_m=0.0)).views
+    write_colmap(room, model, binary)
+    made = prepared(room, metres_per_unit=1 / SCALE)
+    # Each camera in the first one's frame: the same whatever the world; poses are float32.
+    steps = [v.world_to_camera.astype(float) for v in (made.views, plain)]
+    steps = [poses @ np.linalg.inv(poses[0]) for poses in steps]
+    np.testing.assert_allclose(*steps, atol=2e-6)
+    np.testing.assert_array_equal(made.views.instance_ids, plain.instance_ids)
+    np.testing.assert_allclose(made.views.intrinsics, plain.intrinsics, atol=1e-4)
+    # Up is found from the cameras, which have no roll, the floor from the pieces.
+    inverse, flat = (np.linalg.inv(v.world_to_camera.astype(float)) for v in (made.views, plain))
+    np.testing.assert_allclose(inverse[:, 1, :3], flat[:, 1, :3], atol=1e-5)
+    assert np.abs(inverse[:, 1, 3] - flat[:, 1, 3]).max() < 0.03
+    assert any("the floor is found where 3 pieces end" in note for note in made.notes)
+
+
+# -- Folders of rooms ------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def rooms(tmp_path):
+    """Four rooms."""
+    return [
+        PosedRoom(tmp_path / "rooms" / f"room_{k}", furniture(0.05 * k)).write(
+            floor_m=0.0, floor_center_m=[0.0, 0.0], metres_per_unit=1.0
+        )
+        for k in range(4)
+    ]
+
+
+@pytest.fixture
+def source(rooms, tmp_path):
+    return Posed(tmp_path / "rooms", classes=SET)
+
+
+def survey(source):
+    with pool(1) as run:
+        return source.survey(run)
+
+
+def test_shards_of_ones_own_classes_can_be_trained_on(source, tmp_path):
+    summary = build_shards(Job(source, tmp_path / "shards"))
+    assert summary.statuses == {"prepared": 4}
+    assert summary.counts["train"]["rooms"] == 3 and summary.counts["test"]["rooms"] == 1
+    assert summary.report["classes"] == {"bed": 4, "chair": 4}
+    data = ViewDataset(tmp_path / "shards", "train", views_per_room=2, mask_step=4)
+    assert data.label_set == SET == tiny_config(tmp_path, label_set=SET).label_set
+    batch = data.__getitems__([(0, 0), (1, 0)])
+    assert batch.object_class.tolist() == [[1, 2], [1, 2]]
+    with pytest.raises(InputError, match="carries no 3D ground truth, which this evaluation"):
+        reference_scenes(tmp_path / "shards", "test")
+    everything = survey(Posed(source.folder, classes=SET, test_share=0.0)).rooms
+    assert {room.split for room in everything} == {"train"} and len(everything) == 4
+
+
+def test_one_room_is_a_folder_of_rooms(source, rooms, tmp_path, monkeypatch):
+    monkeypatch.chdir(rooms[1].folder)
+    summary = build_shards(Job(Posed(rooms[1].folder, classes=SET), tmp_path / "out"))
+    assert summary.counts["train"]["rooms"] == 1 and summary.statuses == {"prepared": 1}
+    assert [room.room_id for room in survey(Posed(Path(), classes=SET)).rooms] == ["room_1"]
+    assert find_rooms(source.folder) == [room.folder for room in rooms]
+    one = Posed(source.folder, classes=SET, only="room_3")
+    assert [room.room_id for room in survey(one).rooms] == ["room_3"]
+
+
+def test_rooms_of_another_size_are_left_out_with_the_reason(source, rooms):
+    PosedRoom(rooms[2].folder, size=(128, 96)).write()
+    found = survey(source)
+    assert [room.room_id for room in found.rooms] == ["room_0", "room_1", "room_3"]
+    (left,) = found.left_out
+    assert (left.room_id, left.status, left.rule) == ("room_2", "filtered", "image_size")
+    (alone,) = survey(Posed(rooms[2].folder, classes=SET)).rooms
+    assert alone.room_id == "room_2"
+    with pytest.raises(InputError, match=r"for --only room_2 .1 were left out; the most frequent"):
+        survey(Posed(source.folder, classes=SET, only="room_2"))
+
+
+def test_settings_follow_the_files(source, rooms):
+    before = source.settings(None)
+    assert json.loads(json.dumps(before)) == before
+    changed = Posed(source.folder, classes=SET, max_side=64).settings(None)
+    assert [key for key in before if before[key] != changed[key]] == ["recipe"]
+    for path in (rooms[0].png(2), rooms[0].folder / "classes.json"):
+        now = source.settings(None)
+        path.write_bytes(path.read_bytes() + b" ")
+        assert source.settings(None)["rooms"] != now["rooms"]
+
+
+def test_damaged_rooms_are_named_and_the_rest_goes_on(source, rooms, tmp_path):
+    (rooms[0].folder / "transforms.json").write_text("{")
+    whole = rooms[1].png(3).read_bytes()
+    rooms[1].png(3).write_bytes(whole[:60])
+    (rooms[2].folder / "transforms.json").unlink()
+    job = Job(Posed(source.folder, classes=SET, test_share=0.0), tmp_path / "out")
+    summary = build_shards(job)
+    assert summary.statuses == {"prepared": 1, "failed": 3}
+    reasons = {line["room_id"]: line["reason"] for line in summary.report["failed"]}
+    assert "transforms.json is not JSON" in reasons["room_0"]
+    assert "frame_00003.png is " in reasons["room_1"]
+    assert "transforms.json cannot be read (No such file" in reasons["room_2"]
+
+
+def test_assumptions_are_said_before_the_work(source, rooms):
+    assert source.assumptions() == []
+    rooms[0].write()
+    rooms[1].write(floor_m=0.0)
+    write_colmap(rooms[2], "PINHOLE", binary=True)
+    said = Posed(source.folder, classes=SET, up="y").assumptions()
+    assert said[0].startswith(
+        "2 of 4 rooms give no floor_m: the floor is estimated from the lowest"
+    )
+    assert said[1].startswith(
+        "3 of 4 rooms give no metres_per_unit: poses are assumed to be in metres,"
+    )
+    assert said[2] == (
+        "In 3 of 4 rooms the tops of the pictures point along z, but y is taken as up; should "
+        "it be --up z?"
+    )
+    told = Posed(source.folder, classes=SET, floor_m=0.0, metres_per_unit=0.5)
+    (lying,) = told.assumptions()
+    assert lying.startswith("1 of 4 rooms do not state the up direction: it is estimated from the")
+    assert "If they roll by 5 degrees, the median error is 1.3 degrees" in lying
+
+
+def test_a_room_that_shows_nothing_is_filtered(source, rooms):
+    for view in range(5):
+        Image.fromarray(np.zeros((96, 128), dtype=np.uint8)).save(rooms[1].png(view))
+    line = source.prepare(RoomTask("room_1", "room_1", "train"), None)
+    assert (line.status, line.rule) == ("filtered", "no_view")
+    assert line.reason == "none of its 5 views shows any object"
+
+
+def test_the_command(rooms, tmp_path, cli):
+    rooms[0].write()
+    words = (
+        "prep-posed", tmp_path / "rooms", "--out", tmp_path / "shards", "--label-set", SET,
+        "--max-side", 64, "--workers", 1, "--test-share", 0.25,
+    )  # fmt: skip
+    made = cli(*words)
+    assert made.exit_code == 0, made.output
+    assert "Note: 1 of 4 rooms give no floor_m" in made.stderr
+    assert "train 3 rooms, 15 views" in made.stdout
+    assert json.loads((tmp_path / "shards/index.json").read_text())["label_set"] == SET
+    looked = cli("inspect", tmp_path / "shards", "--room", "room_0")
+    assert looked.exit_code == 0 and "unknown" in looked.stdout, looked.output
+    checked = cli("inspect", tmp_path / "shards", "--verify")
+    assert checked.exit_code == 0, checked.output
+    assert "nothing wrong is found, but little is checked. " in " ".join(checked.stdout.split())
+    rooms[2].png(0).unlink()
+    assert "was begun with other settings (rooms differ)" in str(cli(*words).exception)
