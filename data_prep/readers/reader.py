@@ -16,7 +16,6 @@ from data_prep.engine.plan import (
 )
 from data_prep.engine.source import (
     SPLITS,
-    Expected,
     Line,
     PreparedRoom,
     RoomTask,
@@ -84,11 +83,6 @@ class Reader(ABC):
     def room_type(self) -> str:
         """Type of the rooms; also in the shards' names."""
         return self.name
-
-    @property
-    def expected(self) -> Expected | None:
-        """Expected counts, for the report."""
-        return None
 
     @abstractmethod
     def scenes(self) -> list[str]:

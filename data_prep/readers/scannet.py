@@ -15,7 +15,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from data_prep.engine.plan import digest, seeded_split
-from data_prep.engine.source import Expected, Line, RoomTask
+from data_prep.engine.source import Line, RoomTask
 from data_prep.readers.frames import Y_UP, chosen_frames, mask_intrinsics, sampled_lines
 from data_prep.readers.labels import LABEL_SET, Labels, read_labels
 from data_prep.readers.mask_zip import MASK_FILES, MaskArchive
@@ -31,10 +31,6 @@ from sceneprior.core.shards import thinned_stuff
 FULL_SIZE = (968, 1296)
 QUARTER_SIZE = (242, 324)
 """(height, width) of ScanNet's colour frames, and a quarter of it, the paper's rendering size."""
-_OFFICIAL = Expected(
-    of="ScanNet v2 by its lists; views as the paper counts them (section 5)",
-    rooms=1513, train=1201, test=312, views=108_059,
-)  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,10 +59,6 @@ class ScanNet(Reader):
         self._check_positive("frame_step")
         if self.masks not in MASK_FILES:
             raise InputError(f"masks is '{self.masks}'; choose {' or '.join(MASK_FILES)}.")
-
-    @property
-    def expected(self) -> Expected | None:
-        return _OFFICIAL if self.train and self.val and self.only is None else None
 
     def options(self) -> dict[str, Any]:
         """See `Reader.options`."""
