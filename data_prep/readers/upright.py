@@ -10,7 +10,7 @@ import numpy as np
 from sceneprior.core.boxes import CUBE_CORNERS
 from sceneprior.core.cameras import camera_centers, nearest_to_rays, pixel_rays
 from sceneprior.core.observations import Observations
-from sceneprior.core.shards import Sightings
+from sceneprior.core.shards import RoomViews, Sightings
 
 VIEWS_AT_MOST = 10
 """Maximum number of views used per object; more only take longer."""
@@ -95,7 +95,7 @@ def fit_upright(
 
 
 def find_floor(
-    seen: Observations, world_to_camera: np.ndarray, intrinsics: np.ndarray
+    seen: Observations | RoomViews, world_to_camera: np.ndarray, intrinsics: np.ndarray
 ) -> tuple[float, int] | None:
     """Find the height at which the lowest pieces end, along y, and the number of these pieces.
 
