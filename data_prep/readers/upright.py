@@ -102,6 +102,7 @@ def find_floor(
     An upright box is fitted to each piece; the floor is at the bottom of the lowest boxes. The
     cameras' world is in metres, and its y points up. None if fewer than two pieces agree.
     """
+    assert seen.instance_ids is not None, "read with images"
     height, width = seen.instance_ids.shape[1:]
     corners, misfit_px = fit_upright(seen, (height, width), world_to_camera, intrinsics)
     believed = misfit_px < _MISFIT_SHARE * max(width, height)
