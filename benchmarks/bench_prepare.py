@@ -27,9 +27,10 @@ import numpy as np
 from harness import children_cpu_s, machine, medians, report
 
 from sceneprior.core.cameras import Pinhole, look_at
+from sceneprior.core.errors import InputError
 from sceneprior.core.meshes import icosphere
 from sceneprior.core.scene import Mesh
-from sceneprior.render.offscreen import Renderer
+from sceneprior.render.offscreen import open_renderer
 
 SIZE = (360, 480)
 PIECES, VIEWS = 12, 20
@@ -56,12 +57,29 @@ def looking_in(angle: float) -> Pinhole:
 
 
 def ids(repeats: int = 9) -> dict[str, Any]:
-    """CPU milliseconds per view."""
+    """CPU milliseconds per view of each renderer, and the share of pixels that agree."""
     meshes = furnished_room()
     cameras = [looking_in(2 * np.pi * view / VIEWS) for view in range(VIEWS)]
-    step = partial(Renderer().instance_ids_of_views, meshes, cameras, SIZE)
-    seconds = medians({"software": step}, repeats, time.process_time)["software"]
-    return {"software_ms": 1000 * seconds / VIEWS}
+    renderers = {}
+    found: dict[str, Any] = {}
+    for kind in ("software", "pyrender"):
+        try:
+            renderers[kind] = open_renderer(kind)
+        except InputError as error:
+            found[f"{kind}_ms"] = str(error)
+    images = {
+        kind: one.instance_ids_of_views(meshes, cameras, SIZE) for kind, one in renderers.items()
+    }
+    steps = {
+        kind: partial(one.instance_ids_of_views, meshes, cameras, SIZE)
+        for kind, one in renderers.items()
+    }
+    for kind, seconds in medians(steps, repeats, time.process_time).items():
+        found[f"{kind}_ms"] = 1000 * seconds / VIEWS
+        found[f"{kind}_name"] = renderers[kind].name
+    if len(images) == 2:
+        found["pixels_agree"] = float((images["software"] == images["pyrender"]).mean())
+    return found
 
 
 def workers(rooms: int) -> dict[str, float]:
@@ -78,7 +96,7 @@ def workers(rooms: int) -> dict[str, float]:
             wall, cpu = time.perf_counter(), children_cpu_s()
             _sceneprior(
                 "prep-front", "--front", homes / "3D-FRONT", "--future", homes / "3D-FUTURE-model",
-                "--out", Path(name) / str(count), "--workers", count,
+                "--out", Path(name) / str(count), "--renderer", "software", "--workers", count,
             )  # fmt: skip
             found[f"workers_{word}_s"] = time.perf_counter() - wall
             found[f"workers_{word}_cpu_s"] = children_cpu_s() - cpu

@@ -180,7 +180,7 @@ def make_shards(drawn: Draw, seed: int, homes: Path, out: Path) -> None:
     )  # fmt: skip
     recipe = load_recipe(drawn.kind, rules)
     source = FrontSource(houses, homes / "3D-FUTURE-model", recipe)
-    build_shards(Job(source, front))
+    build_shards(Job(source, front, renderer="software"))
     names = label_set(read_index(front)["label_set"])
     rooms = [
         shard.read_room(room_id, images=True)

@@ -33,7 +33,7 @@ def made_shards(folder: Path, rooms: int, workers: int) -> Path:
         front, future = homes / "3D-FRONT", homes / "3D-FUTURE-model"
         splits = homes / "splits" / "bedroom.csv"
         source = FrontSource(front, future, load_recipe("bedroom"), splits)
-        build_shards(Job(source, shards, workers))
+        build_shards(Job(source, shards, workers, renderer="software"))
     return shards
 
 

@@ -80,6 +80,7 @@ def prep_front(
     ] = None,
     seed: Seed = 0,
     workers: Workers = None,
+    renderer: Annotated[str, typer.Option(help="auto, pyrender or software.")] = "auto",
     only: Annotated[
         str | None, typer.Option(help="One house or room only: HOUSE, HOUSE/ROOM or a room id.")
     ] = None,
@@ -97,7 +98,7 @@ def prep_front(
         changes.append(f"views.per_m2={views_per_m2}")
     rules = load_recipe(recipe, tuple(changes))
     source = FrontSource(front, future, rules, splits, seed, only)
-    run_job(source, out, workers, retry_failed)
+    run_job(source, out, workers, retry_failed, renderer)
 
 
 def recipe(
@@ -321,7 +322,13 @@ def _verify(shards: Path, room: str | None, workers: int) -> None:
     typer.echo(f"{shards}: {summary(found)}")
 
 
-def run_job(source: "Source", out: Path, workers: int | None, retry_failed: bool = False) -> None:
+def run_job(
+    source: "Source",
+    out: Path,
+    workers: int | None,
+    retry_failed: bool = False,
+    renderer: str = "auto",
+) -> None:
     """Build shards and print the report, for every `prep-*` command."""
     from rich.console import Console
 
@@ -329,7 +336,7 @@ def run_job(source: "Source", out: Path, workers: int | None, retry_failed: bool
     from data_prep.engine.report import report_tables
 
     try:
-        summary = build_shards(Job(source, out, workers, retry_failed))
+        summary = build_shards(Job(source, out, workers, renderer, retry_failed))
     except KeyboardInterrupt:
         typer.echo("Stopped; finished shards are kept. Run the same command to continue.", err=True)
         raise typer.Exit(130) from None

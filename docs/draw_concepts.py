@@ -85,7 +85,7 @@ def training_room() -> Iterator[Shard]:
         make_homes(folder / "homes", 40, "bedroom", seed=0)  # enough to hold the room
         front, future = folder / "homes" / "3D-FRONT", folder / "homes" / "3D-FUTURE-model"
         source = FrontSource(front, future, load_recipe("bedroom"), only=ROOM)
-        build_shards(Job(source, folder / "shards"))
+        build_shards(Job(source, folder / "shards", renderer="software"))
         (path,) = (folder / "shards").glob("*/*.h5")
         with Shard(path) as shard:
             yield shard

@@ -9,7 +9,7 @@ from sceneprior.core.classes import STUFF
 from sceneprior.core.observations import observe
 from sceneprior.core.scene import Mesh
 from sceneprior.core.shards import RoomViews, stuff_size, stuff_step, thinned_intrinsics
-from sceneprior.render.offscreen import Renderer
+from sceneprior.render.offscreen import SoftwareRenderer
 
 SIZE, HEIGHT_M = (180, 240), 2.5
 L_SHAPE = [(-2.0, -1.5), (2.0, -1.5), (2.0, 0.3), (0.5, 0.3), (0.5, 1.5), (-2.0, 1.5)]
@@ -46,7 +46,7 @@ def shell_room(
     focal = size[1] / 2
     K = np.array([[focal, 0, size[1] / 2], [0, focal, size[0] / 2], [0, 0, 1]])
     small = thinned_intrinsics(K, stuff_step(size))
-    renderer = Renderer()
+    renderer = SoftwareRenderer()
 
     def draw(what: list[Mesh], lens: np.ndarray, its_size: tuple[int, int]) -> np.ndarray:
         cameras = [Pinhole(pose, lens) for pose in poses]

@@ -21,6 +21,6 @@ def test_docstring_examples():
     assert {
         "sceneprior.apps.api",
         "sceneprior.render.silhouettes.render",
-        "sceneprior.render.zbuffer",
+        "sceneprior.render.offscreen.zbuffer",
         "data_prep.front.viewpoints",
     } <= having

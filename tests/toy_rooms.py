@@ -16,7 +16,7 @@ from sceneprior.core.files import write_whole
 from sceneprior.core.scene import Mesh
 from sceneprior.core.shard_writing import shard_bytes
 from sceneprior.core.shards import RoomGroundTruth, RoomViews
-from sceneprior.render.offscreen import Renderer
+from sceneprior.render.offscreen import SoftwareRenderer
 
 LABEL_SET = "front3d_bedroom"
 IMAGE_SIZE = (72, 96)
@@ -68,7 +68,7 @@ def make_toy_room(room_id: str, rng: np.random.Generator) -> tuple[RoomViews, Ro
     poses = np.stack([_camera(angle, rng) for angle in np.arange(VIEWS) * 2 * np.pi / VIEWS])
     height, width = IMAGE_SIZE
     lens = np.array([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1]])
-    images = Renderer().instance_ids_of_views(
+    images = SoftwareRenderer().instance_ids_of_views(
         meshes, [Pinhole(pose, lens) for pose in poses], IMAGE_SIZE
     )
     boxes, visible, pixels = measure(images, len(labels))

@@ -47,19 +47,20 @@ from sceneprior.core.files import (
 from sceneprior.core.scene import Mesh
 from sceneprior.core.shard_writing import check_views, shard_bytes
 from sceneprior.core.shards import INDEX_NAME, MODELS_FOLDER, RoomGroundTruth, RoomViews
-from sceneprior.render.offscreen import Renderer
+from sceneprior.render.offscreen import Renderer, open_renderer
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 @dataclass(frozen=True)
 class Job:
-    """Arguments of a `prep-*` command. Only `source` affects the bytes written."""
+    """Arguments of a `prep-*` command. Only `source` and `renderer` affect the bytes written."""
 
     source: Source
     out: Path
     workers: int | None = 1
     """Number of processes on this machine; 1 works in this process, None takes all cores."""
+    renderer: str = "auto"
     retry_failed: bool = False
 
 
@@ -69,14 +70,19 @@ def build_shards(job: Job) -> Summary:
     settings = job_settings(source, source.only)  # rejects wrong input folders before `out` exists
     cores = len(os.sched_getaffinity(0))
     with claimed(out), pool(job.workers or cores) as run:
-        plan = read_plan(out, source, settings)
+        plan = read_plan(out, source, settings, job.renderer)
         if plan is None:
-            settings["renderer"] = Renderer.name if source.draws else None
+            kinds = run(_renderer_kind, [(job.renderer,)], None) if source.draws else iter([None])
+            settings["renderer"] = next(kinds)
             survey = source.survey(run)
             plan = JobPlan(settings, survey.rooms, survey.left_out)
             with writing(out):
                 write_json(out / PLAN_NAME, asdict(plan))
         return _carry_out(replace(job, out=out), plan, run)
+
+
+def _renderer_kind(kind: str) -> str:
+    return open_renderer(kind).kind
 
 
 def _carry_out(job: Job, plan: JobPlan, run: Run) -> Summary:
@@ -162,7 +168,7 @@ def make_shard(
         # The report is deleted first, so that the shard counts as unfinished if the job stops here.
         _report_path(path).unlink(missing_ok=True)
         path.unlink(missing_ok=True)
-        renderer = None if renderer_kind is None else Renderer()
+        renderer = None if renderer_kind is None else open_renderer(renderer_kind)
         report = ShardReport(renderer.name if renderer else None, [])
         rooms = _prepared(source, out, renderer, shard, report.lines)
         data = shard_bytes(shard.name, source.label_set, rooms)

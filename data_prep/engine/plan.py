@@ -16,7 +16,6 @@ from pydantic import TypeAdapter, ValidationError
 from data_prep.engine.source import SPLITS, Line, RoomTask, Source, Survey
 from sceneprior.core.errors import InputError
 from sceneprior.core.shards import INDEX_NAME
-from sceneprior.render.offscreen import Renderer
 
 PLAN_NAME = "plan.json"
 PLAN_VERSION = 3
@@ -59,10 +58,11 @@ def job_settings(source: Source, only: str | None) -> dict[str, Any]:
     return json.loads(json.dumps(settings | source.settings(only)))
 
 
-def read_plan(out: Path, source: Source, settings: dict[str, Any]) -> JobPlan | None:
+def read_plan(out: Path, source: Source, settings: dict[str, Any], renderer: str) -> JobPlan | None:
     """Read the plan of an earlier run with the same `job_settings`; None if there was none.
 
-    `--only` may work on part of a folder that was begun without it.
+    `--renderer auto` resumes with the renderer of that run; `--only` may work on part of a folder
+    that was begun without it.
     """
     path = out / PLAN_NAME
     if not path.is_file():
@@ -82,7 +82,7 @@ def read_plan(out: Path, source: Source, settings: dict[str, Any]) -> JobPlan | 
     if source.only is not None and before.get("only", "") is None:
         settings = job_settings(source, None)
     changed = [key for key in settings if before.get(key) != settings[key]]
-    if source.draws and drawn_with != Renderer.name:  # earlier releases could draw with pyrender
+    if source.draws and renderer not in ("auto", drawn_with):
         changed.append("renderer")
     if changed:
         raise InputError(

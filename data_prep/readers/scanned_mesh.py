@@ -13,7 +13,7 @@ from sceneprior.core.checked import checked
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
 from sceneprior.core.scene import Mesh
-from sceneprior.render.zbuffer import NEAR_PLANE_M, rasterize
+from sceneprior.render.offscreen.zbuffer import NEAR_PLANE_M, rasterize
 
 _M = TypeVar("_M", bound=BaseModel)
 _Index = Annotated[int, Field(strict=True, ge=0, lt=2**31)]

@@ -36,7 +36,7 @@ from sceneprior.core.checked import checked
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
-from sceneprior.render.zbuffer import rasterize
+from sceneprior.render.offscreen.zbuffer import rasterize
 
 _IPHONE = "iphone/pose_intrinsic_imu.json"
 _IPHONE_SIZE = (1440, 1920)

@@ -25,7 +25,7 @@ from sceneprior.core.classes import class_colors, label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.repeatable import single_threaded
 from sceneprior.core.scene import Scene
-from sceneprior.render.offscreen import Renderer
+from sceneprior.render.offscreen import SoftwareRenderer
 from sceneprior.render.topdown import topdown, topdown_protocol
 
 CHUNK = 2
@@ -193,7 +193,7 @@ class Drawing:
             **topdown_protocol(self.label_set).as_dict(),
             "projection": "orthographic, straight down; one flat colour per class; no floor",
             "class_colors": class_colors(len(label_set(self.label_set))).tolist(),
-            "renderer": Renderer.name,
+            "renderer": SoftwareRenderer.name,
         }
 
     @cached_property

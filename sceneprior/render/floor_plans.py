@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 from sceneprior.core.cameras import Orthographic
 from sceneprior.core.scene import Scene
 from sceneprior.render.appearance import BACKGROUND, FLOOR_COLOR, object_colors, scene_meshes
-from sceneprior.render.offscreen import Renderer
+from sceneprior.render.offscreen import SoftwareRenderer
 from sceneprior.render.pictures import paint_ids
 
 PLAN_PX, LEGEND_PX, FONT_PX = 512, 150, 13
@@ -45,7 +45,7 @@ def plan_of(scene: Scene, center: Float[np.ndarray, "2"], side_m: float) -> Imag
         height_m = max(float(mesh.vertices_m[:, 1].max()) for mesh in meshes) + 1
         x, z = center
         camera = np.array([[1.0, 0, 0, -x], [0, 0, 1, -z], [0, -1, 0, height_m], [0, 0, 0, 1]])
-        ids = Renderer().instance_ids(meshes, Orthographic(camera, 1 / scale), ids.shape)
+        ids = SoftwareRenderer().instance_ids(meshes, Orthographic(camera, 1 / scale), ids.shape)
     plan = Image.new("RGB", (PLAN_PX, PLAN_PX), BACKGROUND)
     draw = ImageDraw.Draw(plan)
 

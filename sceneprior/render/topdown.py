@@ -22,7 +22,7 @@ from sceneprior.render.appearance import (
     object_colors,
     scene_meshes,
 )
-from sceneprior.render.offscreen import Renderer
+from sceneprior.render.offscreen import SoftwareRenderer
 from sceneprior.render.pictures import paint_ids, png_bytes
 
 DIRECTION = np.array([0.42, 0.62, 0.66])
@@ -83,7 +83,7 @@ def topdown(
         height = protocol.camera_height_m
         world_to_camera = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, height], [0, 0, 0, 1]])
         camera = Orthographic(world_to_camera, protocol.metres_per_pixel)
-        ids = Renderer().instance_ids(scene_meshes(scene), camera, protocol.image_size)
+        ids = SoftwareRenderer().instance_ids(scene_meshes(scene), camera, protocol.image_size)
     if outlines:
         return paint_ids(ids, object_colors(scene), protocol.background)
     colors = class_colors(len(label_set(scene.label_set)))[scene.class_indices]
@@ -184,7 +184,9 @@ def perspective(
     meshes = [*scene_meshes(scene), view.floor, *view.walls]
     # Walls cast no shadows: they would darken the whole room.
     shadowed = len(meshes) - len(walls)
-    return Renderer().shaded(meshes, colors, view.camera, view.image_size, BACKGROUND, shadowed)
+    return SoftwareRenderer().shaded(
+        meshes, colors, view.camera, view.image_size, BACKGROUND, shadowed
+    )
 
 
 def html_of(scene: Scene) -> str:

@@ -24,7 +24,7 @@ def front_job(front: FrontFolder, out: Path, **changes: Any) -> Job:
     names = {item.name for item in fields(FrontSource)}
     of_source = {name: changes.pop(name) for name in list(changes) if name in names}
     source = FrontSource(front.front, front.future, **{"recipe": recipe, **of_source})
-    return Job(source, out, **changes)
+    return Job(source, out, **{"renderer": "software", **changes})
 
 
 def three_houses(front: FrontFolder) -> None:

@@ -11,7 +11,7 @@ def prep(front, tmp_path, cli):
         rules = [word for rule in SMALL for word in ("--rule", rule)]
         return cli(
             "prep-front", "--front", front.front, "--future", front.future,
-            "--out", tmp_path / "shards", "--workers", 1, *rules, *words,
+            "--out", tmp_path / "shards", "--workers", 1, "--renderer", "software", *rules, *words,
         )  # fmt: skip
 
     return run

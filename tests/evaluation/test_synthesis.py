@@ -19,7 +19,7 @@ from sceneprior.evaluation import synthesis
 from sceneprior.evaluation.metrics import picture_classifiers
 from sceneprior.evaluation.score_table import headings, print_scores, score_rows
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
-from sceneprior.render.offscreen import Renderer
+from sceneprior.render.offscreen import SoftwareRenderer
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def test_the_printed_table_holds_a_column_a_set(result):
 def test_what_cannot_be_scored_is_refused_before_anything_is_drawn(
     generated, shards, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(Renderer, "instance_ids", None, raising=True)
+    monkeypatch.setattr(SoftwareRenderer, "instance_ids", None, raising=True)
     with pytest.raises(InputError, match="at least 2 generated rooms, but there are 1"):
         evaluate_synthesis(generated[:1], shards, EvalOptions())
     with pytest.raises(InputError, match="scenes of one label set"):

@@ -17,7 +17,7 @@ from sceneprior.core.observed_image import ObservedImage
 from sceneprior.core.scene import Scene
 from sceneprior.evaluation.page import png_uri, write_rooms_page
 from sceneprior.render.appearance import object_colors, quiet_colors, scene_meshes
-from sceneprior.render.offscreen import Renderer
+from sceneprior.render.offscreen import SoftwareRenderer
 from sceneprior.render.pictures import contact_sheet, paint_ids, png_bytes
 from sceneprior.render.topdown import topdown, topdown_protocol
 
@@ -77,7 +77,7 @@ def picture(found: Reconstruction) -> UInt8[np.ndarray, "height width 3"]:
         "masks given": paint_ids(
             image.instance_ids.astype(np.int64), colors[image.object_class], PAPER
         ),
-        "found, same camera": Renderer().shaded(
+        "found, same camera": SoftwareRenderer().shaded(
             scene_meshes(scene), object_colors(scene), camera, image.instance_ids.shape
         ),
         "found, from above": from_above(scene, image),

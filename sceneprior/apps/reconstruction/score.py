@@ -31,7 +31,7 @@ from sceneprior.lifted.reconstruction.known_rooms import (
     nearest_answers,
     random_answers,
 )
-from sceneprior.render.offscreen import Renderer
+from sceneprior.render.offscreen import SoftwareRenderer
 from sceneprior.render.scene_files import load_scene_folder
 
 TITLES = {
@@ -193,7 +193,7 @@ def score_answers(
 ) -> dict[str, Any]:
     """Scores by row: rows of the given reconstructions, and baseline rows of training rooms."""
     rooms = known_rooms(shards)
-    nearest = nearest_answers(rooms, images, Renderer())
+    nearest = nearest_answers(rooms, images, SoftwareRenderer())
     drawn = random_answers(rooms, images, seed)
     answers = {
         **answers,

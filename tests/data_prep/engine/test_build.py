@@ -136,7 +136,7 @@ def test_houses_made_by_others(tmp_path):
     folder = shared_front()
     recipe = load_recipe("bedroom", ("views.per_m2=0.5",))
     source = FrontSource(folder / "3D-FRONT", folder / "3D-FUTURE-model", recipe, only="0022c821")
-    build_shards(Job(source, tmp_path / "a"))
+    build_shards(Job(source, tmp_path / "a", renderer="software"))
     ((views, _),) = rooms_of(tmp_path / "a").values()
     assert views.room_id == "0022c821-c1f2-516e-8552-8f01efccfc26_MasterBedroom-8629"
     names = [label_set("front3d_bedroom")[c] for c in views.object_class]

@@ -59,7 +59,8 @@ def test_the_kernel_refuses_large_files(front, tmp_path, workers):
     out = tmp_path / "shards"
     command = [
         sys.executable, "-m", "sceneprior", "prep-front", "--front", front.front, "--out", out,
-        "--future", front.future, "--workers", str(workers), "--views-per-m2", "0.5",
+        "--future", front.future, "--workers", str(workers), "--renderer", "software",
+        "--views-per-m2", "0.5",
     ]  # fmt: skip
     limit = (20_000, 20_000)
     done = subprocess.run(

@@ -105,7 +105,8 @@ def test_the_command_is_stopped_and_gone_on_with(front, tmp_path, start, how):
     out = tmp_path / "shards"
     command = [
         sys.executable, str(script), "prep-front", "--front", str(front.front), "--out", str(out),
-        "--future", str(front.future), "--workers", "2", "--views-per-m2", "3",
+        "--future", str(front.future), "--workers", "2", "--renderer", "software",
+        "--views-per-m2", "3",
     ]  # fmt: skip
     process = start(command, stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 400

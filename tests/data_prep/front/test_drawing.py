@@ -11,12 +11,12 @@ from data_prep.front.recipe import load_recipe
 from sceneprior.core.cameras import camera_centers
 from sceneprior.core.classes import STUFF
 from sceneprior.core.shards import stuff_size, stuff_step, thinned, thinned_intrinsics
-from sceneprior.render.offscreen import Renderer
+from sceneprior.render.offscreen import SoftwareRenderer
 
 SMALL = ("views.image_size=[60, 80]", "views.min_object_pixels=20")
 
 
-class CountingRenderer(Renderer):
+class CountingRenderer(SoftwareRenderer):
     """Counts views; the first `blind` of them see nothing."""
 
     def __init__(self, blind=0):
@@ -57,7 +57,7 @@ def test_views_that_see_too_little_are_drawn_again_and_the_best_stays(drawn_room
 
 
 def test_the_room_and_the_seed_decide(drawn_room):
-    renderer = Renderer()
+    renderer = SoftwareRenderer()
     one, other, third = (prepare(drawn_room, renderer, seed=seed)[0] for seed in (0, 0, 1))
     np.testing.assert_array_equal(one.world_to_camera, other.world_to_camera)
     np.testing.assert_array_equal(one.instance_ids, other.instance_ids)
@@ -70,7 +70,7 @@ def test_the_room_and_the_seed_decide(drawn_room):
 
 def test_floor_and_walls_are_drawn_behind_furniture(drawn_room):
     """Each pixel shows what its ray meets: the floor at y = 0, or the wall at z = -2."""
-    views, _ = prepare(drawn_room, Renderer(), "views.image_size=[180, 480]")
+    views, _ = prepare(drawn_room, SoftwareRenderer(), "views.image_size=[180, 480]")
     step = stuff_step(views.image_size)
     assert step == 2 and views.stuff.shape[1:] == stuff_size(views.image_size)
     free = views.instance_ids[(..., *thinned(step))] == 0

@@ -66,7 +66,7 @@ def kitchen_job(front: FrontFolder, out: Path, **changes: object) -> Job:
     path.write_text(yaml.safe_dump({**yaml.safe_load(first_block(PAGE, "yaml")), **changes}))
     rules = ("views.image_size=[90, 120]", "views.per_m2=0.5", "views.min_object_pixels=20")
     recipe = load_recipe(str(path), rules)
-    return Job(FrontSource(front.front, front.future, recipe), out)
+    return Job(FrontSource(front.front, front.future, recipe), out, renderer="software")
 
 
 def test_categories_get_the_classes_of_the_users_recipe(tmp_path):

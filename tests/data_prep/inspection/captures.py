@@ -28,7 +28,7 @@ def make_captures(folder: Path, rooms: int = 6, seed: int = 0, views_per_m2: flo
     rules = (f"views.per_m2={views_per_m2}", "views.image_size=[90, 120]",
              "views.min_object_pixels=20")  # fmt: skip
     source = FrontSource(data / "3D-FRONT", data / "3D-FUTURE-model", load_recipe("bedroom", rules))
-    build_shards(Job(source, shards))
+    build_shards(Job(source, shards, renderer="software"))
     write_captures(shards, folder)
 
 

@@ -24,7 +24,7 @@ def homes(folder):
     make_homes(data, 4, "bedroom", seed=0)
     rules = ("views.per_m2=0.6", "views.image_size=[180, 240]", "views.min_object_pixels=60")
     source = FrontSource(data / "3D-FRONT", data / "3D-FUTURE-model", load_recipe("bedroom", rules))
-    build_shards(Job(source, folder))
+    build_shards(Job(source, folder, renderer="software"))
 
 
 def scans(folder):

@@ -17,7 +17,7 @@ from data_prep.readers.posed.reader import Posed
 from data_prep.readers.posed.recording import room_name
 from data_prep.readers.upright import own_sides
 from sceneprior.core.shards import RoomViews
-from sceneprior.render.zbuffer import rasterize
+from sceneprior.render.offscreen.zbuffer import rasterize
 
 SET = "void,bed,chair"
 EYES = [(-2.0, -2, 1.6), (2.2, -2, 1.5), (2.4, 2.2, 1.7), (-2.2, 2, 1.5), (0.2, -2.6, 1.9)]

@@ -183,7 +183,7 @@ class ScanFolder:
 
     def nearest(self, pose: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
         """Nearest triangle of the mesh (-1 = none), and its depth, in each pixel."""
-        from sceneprior.render.zbuffer import rasterize
+        from sceneprior.render.offscreen.zbuffer import rasterize
 
         down, across = size[0] / self.size[0], size[1] / self.size[1]
         vertices, faces, _ = self.mesh

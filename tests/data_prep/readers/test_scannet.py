@@ -52,7 +52,7 @@ from sceneprior.core.classes import STUFF, label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.shard_writing import room_checksum
 from sceneprior.core.shards import Shard, iterate_rooms
-from sceneprior.render.zbuffer import rasterize
+from sceneprior.render.offscreen.zbuffer import rasterize
 
 BITS = (np.arange(8)[:, None] >> np.arange(3)) & 1
 NAMES = label_set("scannet")

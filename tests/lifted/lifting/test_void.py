@@ -16,7 +16,7 @@ from sceneprior.lifted.lifting import RayPool, ShapeGrid
 from sceneprior.lifted.lifting.boxes import draw_rays, lift_boxes
 from sceneprior.lifted.lifting.hulls import lift_shapes
 from sceneprior.lifted.lifting.part_fit import fit_parts
-from sceneprior.render.offscreen import Renderer
+from sceneprior.render.offscreen import SoftwareRenderer
 
 GRID = ShapeGrid(cells=24, margin=1.15)
 BED_M = np.array([1.6, 0.6, 2.0])
@@ -38,7 +38,7 @@ def room_of(chest_class: int):
             for k, a in enumerate(np.linspace(-2.0, 2.0, 12))
         ]
     )  # fmt: skip
-    images = Renderer().instance_ids_of_views(
+    images = SoftwareRenderer().instance_ids_of_views(
         meshes, [Pinhole(pose, lens) for pose in poses], (120, 160)
     )
     return observe(images, [9, chest_class]).room_views("room", poses, lens)

@@ -12,8 +12,8 @@ from torch.testing import assert_close
 from toy_rooms import look_at
 
 from sceneprior.core.meshes import icosphere
+from sceneprior.render.offscreen.zbuffer import rasterize
 from sceneprior.render.silhouettes.render import render_scene, render_silhouettes, sigma_from_ndc
-from sceneprior.render.zbuffer import rasterize
 
 
 def lumpy_room() -> dict:
@@ -164,7 +164,7 @@ def test_wrong_settings_are_named(options, message):
 def test_the_package_exports_the_renderer_and_loads_torch_only_for_it():
     code = (
         "import sys\n"
-        "import sceneprior.render.zbuffer\n"
+        "import sceneprior.render.offscreen.zbuffer\n"
         "assert 'torch' not in sys.modules\n"
         "from sceneprior.render.silhouettes import (\n"
         "    RenderedScene, render_scene, render_silhouettes)\n"

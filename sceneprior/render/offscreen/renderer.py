@@ -1,5 +1,10 @@
-"""Off-screen pictures of meshes: instance ids, and shaded pictures with soft shadows."""
+"""Renderers and their cameras: the interface, the software renderer, and shaded pictures.
 
+The z-buffer is imported when it draws: Numba takes 60 MB and half a second, which commands that
+draw nothing (prep-scannet) should not spend.
+"""
+
+import abc
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -7,31 +12,29 @@ import numpy as np
 
 from sceneprior.core.cameras import Camera, Pinhole, to_camera
 from sceneprior.core.scene import Mesh
-from sceneprior.render.zbuffer import rasterize, sky_light
+from sceneprior.render.offscreen.sky import sky_light
 
 EVEN = 0.2
 """Exponent that brightens walls and evens out their brightness: 0.4 becomes 0.83."""
 
 
-class Renderer:
-    """Draws meshes with the z-buffer: no system libraries, the same pixels on every machine."""
+class Renderer(abc.ABC):
+    """A renderer of meshes; `open_renderer` returns one."""
 
-    name = "software"
-    """Name for reports."""
+    name: str
+    """Name for reports: "software" or "pyrender (EGL, <name of the GL renderer>)"."""
+    kind: str
+    """Argument of `open_renderer` for the same renderer: "pyrender" or "software"."""
 
+    @abc.abstractmethod
     def instance_ids_of_views(
         self, meshes: Sequence[Mesh], cameras: Sequence[Camera], image_size: tuple[int, int]
     ) -> np.ndarray:
         """Draw which mesh is visible at each pixel centre, in several views of one room.
 
         Returns (views, height, width) uint16: k + 1 where `meshes[k]` is visible, 0 for no mesh.
-        Both sides of a face are drawn. Among equally near faces, that of the first mesh is drawn.
+        Both sides of a face are drawn.
         """
-        soup = _join(meshes)
-        images = np.empty((len(cameras), *image_size), dtype=np.uint16)
-        for image, camera in zip(images, cameras, strict=True):
-            image[...] = _draw(soup, camera, image_size, labels=soup.mesh_of_face)[0] + 1
-        return images
 
     def instance_ids(
         self, meshes: Sequence[Mesh], camera: Camera, image_size: tuple[int, int]
@@ -53,7 +56,8 @@ class Renderer:
         The light comes from the camera. If the camera is a `Pinhole`, the first `shadowed` meshes
         also shadow each other softly under light from the sky (`sky.py`). The other meshes, such as
         walls, are lit almost evenly if `shadowed` is not 0. The background is a colour, or a
-        picture of the same size.
+        picture of the same size. Both renderers draw this with the software z-buffer, so that
+        pictures look the same everywhere.
         """
         height, width = image_size
         soup = _join(meshes)
@@ -75,6 +79,22 @@ class Renderer:
         behind = np.broadcast_to(np.asarray(background), (height, width, 3))[:, None, :, None]
         fine = np.where((face_index < 0).reshape(height, 2, width, 2, 1), behind, fine)
         return np.rint(fine.mean(axis=(1, 3))).astype(np.uint8)
+
+
+class SoftwareRenderer(Renderer):
+    """The package's Numba z-buffer: no system libraries, the same pixels on every machine."""
+
+    name = "software"
+    kind = "software"
+
+    def instance_ids_of_views(
+        self, meshes: Sequence[Mesh], cameras: Sequence[Camera], image_size: tuple[int, int]
+    ) -> np.ndarray:
+        soup = _join(meshes)
+        images = np.empty((len(cameras), *image_size), dtype=np.uint16)
+        for image, camera in zip(images, cameras, strict=True):
+            image[...] = _draw(soup, camera, image_size, labels=soup.mesh_of_face)[0] + 1
+        return images
 
 
 class _Soup(NamedTuple):
@@ -107,6 +127,8 @@ def _draw(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw with `zbuffer.rasterize` and return its result; `image_size` is the supersampled
     size."""
+    from sceneprior.render.offscreen.zbuffer import rasterize
+
     if isinstance(camera, Pinhole):
         K = np.asarray(camera.intrinsics, dtype=np.float64) * supersampling
         projection = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])

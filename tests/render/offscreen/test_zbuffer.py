@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sceneprior.render.zbuffer import rasterize
+from sceneprior.render.offscreen.zbuffer import rasterize
 
 IDENTITY = np.eye(4)
 LENS = (8.0, 8.0, 8.0, 8.0)

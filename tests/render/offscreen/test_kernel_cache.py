@@ -9,7 +9,7 @@ from pathlib import Path
 import sceneprior
 
 CALL = (
-    "from sceneprior.render import zbuffer\n"
+    "from sceneprior.render.offscreen import zbuffer\n"
     "zbuffer._project(*(1.0,) * 7, True)\n"
     "stats = zbuffer._project.stats\n"
     "print(zbuffer.__file__, stats.cache_path, len(stats.cache_hits), len(stats.cache_misses))"
@@ -21,7 +21,7 @@ def test_kernels_of_a_read_only_package_are_kept_for_the_user(tmp_path):
     ignored = shutil.ignore_patterns("__pycache__", "*.prior", "model_viewer")
     shutil.copytree(Path(sceneprior.__file__).parent, package, ignore=ignored)
     # A file in the folder's place, since root may write to read-only folders.
-    (package / "render" / "__pycache__").touch()
+    (package / "render" / "offscreen" / "__pycache__").touch()
     cache = tmp_path / "cache"
     environment = os.environ | {"XDG_CACHE_HOME": str(cache), "PYTHONDONTWRITEBYTECODE": "1"}
     environment.pop("NUMBA_CACHE_DIR", None)

@@ -1,0 +1,174 @@
+"""Off-screen instance ids with pyrender, on EGL or OSMesa."""
+
+import contextlib
+import ctypes
+import ctypes.util
+import importlib.util
+import os
+import sys
+import types
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from sceneprior.core.cameras import Camera, Pinhole
+from sceneprior.core.scene import Mesh
+from sceneprior.render.offscreen.gl_ids import id_renderer_class
+from sceneprior.render.offscreen.renderer import Renderer
+
+_FAR_M = 200.0
+
+
+class NoGLError(Exception):
+    """GL does not work on this machine; the message completes "because ..."."""
+
+
+def _probe_gl() -> str:
+    """Find the GL platform with ctypes alone: "egl" or "osmesa".
+
+    PyOpenGL is not imported for this: its errors without GL are unhelpful, and it chooses its
+    platform once per process.
+    """
+    try:
+        ctypes.CDLL("libGL.so.1")
+        egl = ctypes.CDLL("libEGL.so.1")
+        egl.eglGetProcAddress.restype = ctypes.c_void_p
+        egl.eglGetProcAddress.argtypes = [ctypes.c_char_p]
+        address = egl.eglGetProcAddress(b"eglQueryDevicesEXT")
+        count = ctypes.c_int(0)
+        if address:
+            query = ctypes.CFUNCTYPE(
+                ctypes.c_uint, ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(ctypes.c_int)
+            )(address)
+            query(0, None, ctypes.byref(count))
+        if count.value > 0:
+            return "egl"
+        reason = "EGL has no device (no driver is installed)"
+    except (OSError, AttributeError):
+        reason = "libEGL or libGL is not installed"
+    if ctypes.util.find_library("OSMesa"):
+        return "osmesa"
+    raise NoGLError(reason)
+
+
+_pyrender: "_PyrenderRenderer | None" = None  # one per process: deleting one breaks the others
+_failure: str | None = None
+
+
+def open_pyrender() -> "_PyrenderRenderer":
+    global _pyrender, _failure
+    if _pyrender is None and _failure is None:
+        try:
+            _load_triton_before_mesa()
+            platform = _probe_gl()
+            if "OpenGL" not in sys.modules:  # PyOpenGL chooses at its first import
+                os.environ.setdefault("PYOPENGL_PLATFORM", platform)
+            _pyrender = _PyrenderRenderer()
+        except NoGLError as error:
+            _failure = str(error)
+        except Exception as error:
+            _failure = f"no GL context can be made ({type(error).__name__}: {error})"
+            _failure = " ".join(_failure.split())[:200]
+    if _pyrender is None:
+        raise NoGLError(_failure)
+    return _pyrender
+
+
+def _load_triton_before_mesa() -> None:
+    # Mesa's software GL and Triton each load an LLVM. A process that loads Triton second, as
+    # Lightning does if Triton is installed, crashes with a segmentation fault.
+    if importlib.util.find_spec("triton") is not None:
+        with contextlib.suppress(Exception):  # a broken Triton should fail where it is used
+            importlib.import_module("triton")
+
+
+class _PyrenderRenderer(Renderer):
+    """pyrender's SEG pass on EGL or OSMesa."""
+
+    kind = "pyrender"
+
+    def __init__(self) -> None:
+        # A stub replaces pyrender's viewer, which needs pyglet, libGLU and an X server.
+        viewer = types.ModuleType("pyrender.viewer")
+        viewer.Viewer = None  # type: ignore[attr-defined]
+        sys.modules.setdefault("pyrender.viewer", viewer)
+        import pyrender
+        from OpenGL.GL import GL_RENDERER, glGetString
+
+        self._pyrender = pyrender
+        self._process = os.getpid()
+        # OffscreenRenderer creates its renderer by this name, again at each size under OSMesa.
+        pyrender.offscreen.Renderer = id_renderer_class()
+        self._offscreen = _open_context(pyrender)
+        self._offscreen._platform.make_current()
+        platform = type(self._offscreen._platform).__name__.removesuffix("Platform")
+        self.name = f"pyrender ({platform}, {glGetString(GL_RENDERER).decode()})"
+        probe = Mesh(np.array([[-9.0, -9, 2], [9, -9, 2], [0, 9, 2]]), np.array([[0, 1, 2]]))
+        K = np.array([[4.0, 0, 4], [0, 4, 4], [0, 0, 1]])
+        drawn = self.instance_ids([probe], Pinhole(np.eye(4), K), (8, 8))
+        if drawn[4, 4] != 1:
+            raise RuntimeError("a test triangle was not drawn")
+
+    def instance_ids_of_views(
+        self, meshes: Sequence[Mesh], cameras: Sequence[Camera], image_size: tuple[int, int]
+    ) -> np.ndarray:
+        if os.getpid() != self._process:
+            raise RuntimeError(
+                "A GL context does not survive a fork; start worker processes with 'spawn'."
+            )
+        images = np.zeros((len(cameras), *image_size), dtype=np.uint16)
+        scene = self._pyrender.Scene()
+        color_of_node = {}
+        for index, mesh in enumerate(meshes):
+            if len(mesh.faces):
+                primitive = self._pyrender.Primitive(
+                    positions=mesh.vertices_m, indices=np.asarray(mesh.faces).reshape(-1, 3)
+                )
+                node = scene.add(self._pyrender.Mesh([primitive], name=f"{index:05d}"))
+                color_of_node[node] = ((index + 1) & 255, (index + 1) >> 8, 0)
+        if not color_of_node:
+            return images
+        self._offscreen.viewport_height, self._offscreen.viewport_width = image_size
+        for image, camera in zip(images, cameras, strict=True):
+            node = self._add_camera(scene, camera, image_size)
+            image[...], _ = self._offscreen.render(
+                scene, self._pyrender.RenderFlags.SEG, seg_node_map=color_of_node
+            )
+            scene.remove_node(node)
+        return images
+
+    def _add_camera(self, scene: Any, camera: Camera, image_size: tuple[int, int]) -> Any:
+        from sceneprior.render.offscreen.zbuffer import NEAR_PLANE_M
+
+        if isinstance(camera, Pinhole):
+            K = np.asarray(camera.intrinsics, dtype=np.float64)
+            pyrender_camera = self._pyrender.IntrinsicsCamera(
+                K[0, 0], K[1, 1], K[0, 2], K[1, 2], znear=NEAR_PLANE_M, zfar=_FAR_M
+            )
+        else:
+            half = camera.metres_per_pixel * image_size[0] / 2
+            pyrender_camera = self._pyrender.OrthographicCamera(
+                half, half, znear=NEAR_PLANE_M, zfar=_FAR_M
+            )
+        to_world = np.linalg.inv(np.asarray(camera.world_to_camera, dtype=np.float64))
+        opengl = to_world @ np.diag([1.0, -1.0, -1.0, 1.0])  # GL looks along -z, with y up
+        return scene.add(pyrender_camera, pose=opengl)
+
+
+def _open_context(pyrender: Any) -> Any:
+    """Open a context on the first EGL device that works; a listed GPU may be inaccessible."""
+    if os.environ.get("PYOPENGL_PLATFORM") != "egl" or "EGL_DEVICE_ID" in os.environ:
+        return pyrender.OffscreenRenderer(8, 8)
+    first_error: Exception | None = None
+    for device in range(16):
+        os.environ["EGL_DEVICE_ID"] = str(device)
+        try:
+            return pyrender.OffscreenRenderer(8, 8)
+        except Exception as error:
+            first_error = first_error or error
+            if isinstance(error, ValueError) and "device ID" in str(error):
+                break  # no more devices
+        finally:
+            del os.environ["EGL_DEVICE_ID"]
+    raise first_error or RuntimeError("EGL lists no device")
