@@ -28,8 +28,6 @@ FOCAL_STEPS = tuple(k for k in range(-8, 9) if k)
 """Powers of 2^(1/6) = 1.12 by which focal lengths are scaled: 0.4 to 2.5."""
 _OFF = (-0.3, -0.15, 0.0, 0.15, 0.3)
 """Shifts of the principal point along each side, relative to the image's size."""
-_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
-"""Rotation from a world with y up to a world with z up."""
 
 
 class Cause(NamedTuple):
@@ -179,11 +177,6 @@ def _dealt_out(room: Room, _: Convention) -> Corrected:
     yield CHANCE, room.seen_by(room.views.world_to_camera[dealt])
 
 
-def _turned(room: Room, _: Convention) -> Corrected:
-    if room.bodies:
-        yield Cause("z up"), room.seen_by(room.views.world_to_camera @ _Z_UP)
-
-
 def _scaled(room: Room, _: Convention) -> Corrected:
     """Translations of another unit, estimated from rays through 2D boxes, which must meet their
     objects."""
@@ -217,30 +210,6 @@ def _scaled(room: Room, _: Convention) -> Corrected:
         tried = [factor * step**k for k in (0, -1, 1, -2, 2)]
         factor = max(tried, key=lambda factor: compare(scaled(factor)).agreement.score)
     yield Cause("unit", factor), scaled(factor)
-
-
-def best_order(room: Room) -> np.ndarray:
-    """Match cameras to frames one to one, so that they fit the masks best: (T,) for each frame, the
-    frame whose camera fits best, which is its own if no other fits better."""
-    boxes = projections(room)[:, None]  # one per camera, the same for all frames
-    frames = len(room.views.visible)
-    pairs = compare_boxes(room, np.broadcast_to(boxes, (frames, frames, *boxes.shape[2:])))
-    gain = ((pairs.held + pairs.iou) * pairs.judged).sum(axis=-1) + 1e-3 * np.eye(frames)
-    return linear_sum_assignment(gain.T, maximize=True)[1]
-
-
-def _other_frames(room: Room, _: Convention) -> Corrected:
-    if room.bodies:
-        order = best_order(room)
-        views = room.views
-        other = room.seen_by(views.world_to_camera[order], views.intrinsics[order])
-        yield Cause("frames"), other._replace(
-            bodies=[
-                body if body is None or body.unoccluded is None
-                else body._replace(unoccluded=body.unoccluded[order])
-                for body in room.bodies
-            ]
-        )  # fmt: skip
 
 
 def _other_ids(room: Room, _: Convention) -> Corrected:
@@ -286,16 +255,10 @@ TABLE: dict[str, Row] = {
     "size": Row(_size, messages.wrong_size),
     "center": Row(_centers, messages.wrong_center, with_truth=False),
     "chance": Row(_dealt_out, _plainly(""), with_truth=False),
-    "z up": Row(_turned, _plainly("the cameras' world seems to have z up instead of y"), "turned"),
     "unit": Row(
         _scaled,
         _plainly("the translations of the cameras seem to have another unit than the objects"),
         "times {:.2g}",
-    ),
-    "frames": Row(
-        _other_frames,
-        _plainly("frames and cameras seem to be out of order"),
-        "with cameras of other frames of the room",
     ),
     "ids": Row(
         _other_ids,
@@ -303,4 +266,4 @@ TABLE: dict[str, Row] = {
         "with ids exchanged",
     ),
 }
-"""Rows by name; the last four need 3D objects."""
+"""Rows by name; the last two need 3D objects."""

@@ -21,7 +21,6 @@ from data_prep.inspection.causes import (
     GIVEN,
     TABLE,
     Cause,
-    best_order,
     corrections,
     sentence_of,
 )
@@ -283,22 +282,17 @@ def disagreement(
     return text + (f", with a mean 2D IoU of {after.mean_iou:.2f}" if after.whole else "")
 
 
-def outliers(room: Room, seen: Comparison) -> Iterator[str]:
+def outliers(seen: Comparison) -> Iterator[str]:
     """Report views and objects that disagree in a room that agrees as a whole."""
     count, held = seen.judged.sum(axis=1), (seen.judged & seen.held).sum(axis=1)
     wrong = np.flatnonzero((count >= 2) & (held < _OUTLIER * count))
     if len(wrong):
-        order = best_order(room)
-        others = order[wrong].tolist()
-        why = "are their poses wrong?"
-        if set(others) & set(wrong.tolist()) and (order[wrong] != wrong).all():
-            pairs = (f"{view} (by {other})" for view, other in zip(wrong, others, strict=True))
-            why = f"those of other frames would fit: {', '.join(pairs)}"
         shown = ", ".join(str(view) for view in wrong[:6])
         more = f" and {len(wrong) - 6} more" if len(wrong) > 6 else ""
         yield (
             f"{held[wrong].sum()} of the {count[wrong].sum()} masks of views {shown}{more} lie "
-            f"within their projections, in other views nearly all do: {why}"
+            "within their projections, in other views nearly all do: are their poses wrong, or "
+            "those of other frames?"
         )
         return
     seen_in = seen.judged.sum(axis=0)

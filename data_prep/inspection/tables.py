@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.table import Column, Table
+from rich.table import Table
 
 from data_prep.engine.report import make_table
 from data_prep.engine.source import SPLITS
@@ -16,7 +16,6 @@ from data_prep.inspection.verify import FolderCheck, RoomCheck, agreement_of, ev
 from sceneprior.core.classes import label_set
 from sceneprior.core.shards import Shard, iterate_rooms, read_index
 
-_WORST_SHOWN = 5
 _JUDGED = ("fit of cameras", "in 3D", "masks within", "mean 2D IoU")
 
 
@@ -81,29 +80,14 @@ def room_table(folder: Path, room_id: str) -> Table:
     return table
 
 
-def check_tables(found: FolderCheck) -> list[Table]:
-    """Results of a check: each split, and the rooms that agree least."""
+def check_table(found: FolderCheck) -> Table:
+    """Results of a check, split by split."""
     totals = []
     for split, checks in found.rooms.items():
         rooms = [check for check in checks if check.room_id]
         views, sums = sum(room.views for room in rooms), sum(room.has_checksum for room in rooms)
         totals.append((split, len(rooms), views, f"{sums} rooms", *_judged(checks)))
-    judged = [
-        check for check in found.every if check.agreement.tallies or _fit([check]) is not None
-    ]
-    tables = [make_table(("split", "rooms", "views", "checksums", *_JUDGED), totals)]
-    if judged:
-        worst = sorted(judged, key=_least)[:_WORST_SHOWN]
-        # Ids are folded, because their ends, the rooms' names, must survive narrow terminals.
-        columns = (Column("worst rooms", overflow="fold"), *_JUDGED)
-        tables.append(make_table(columns, [(check.room_id, *_judged([check])) for check in worst]))
-    return tables
-
-
-def _least(check: RoomCheck) -> float:
-    shares = [tally.share for tally in check.agreement.tallies.values()]
-    fit = _fit([check])
-    return min(shares if fit is None else [*shares, fit])
+    return make_table(("split", "rooms", "views", "checksums", *_JUDGED), totals)
 
 
 def _fit(checks: Sequence[RoomCheck]) -> float | None:

@@ -264,9 +264,8 @@ def _check_room(
     if truth is None:
         return check
     bodies, found = true_bodies(views, truth, folder)
-    room = Room(views, bodies)
-    seen = compare(room)
-    odd = () if seen.agreement.failing(**_OF_ROOM) else outliers(room, seen)
+    seen = compare(Room(views, bodies))
+    odd = () if seen.agreement.failing(**_OF_ROOM) else outliers(seen)
     return replace(
         check, problems=(*problems, *found), agreement=seen.agreement, outliers=tuple(odd)
     )

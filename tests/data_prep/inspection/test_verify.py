@@ -6,11 +6,8 @@ import h5py
 import numpy as np
 import pytest
 from front_jobs import change_room, six_bedrooms_shards
-from rich.console import Console
 
-from data_prep.inspection.agreement import Agreement, Tally
-from data_prep.inspection.tables import check_tables
-from data_prep.inspection.verify import FolderCheck, RoomCheck, verify
+from data_prep.inspection.verify import verify
 from sceneprior.core.errors import InputError
 
 RULES = ("views.per_m2=1.5", "views.image_size=[120, 160]")
@@ -25,16 +22,6 @@ def shards(made_once, tmp_path):
 def test_several_workers_find_the_same(shards):
     found = verify(shards)
     assert found.problems == () and verify(shards, workers=2) == found
-
-
-def test_the_worst_rooms_keep_their_names_in_a_narrow_terminal():
-    name = "2bc95aea-aa71-57ad-9ed2-3852b7420110_LivingDiningRoom-1010"
-    check = RoomCheck("train/a.h5", name, agreement=Agreement({"mesh": Tally(9, 9)}))
-    console = Console(width=60, record=True)
-    console.print(check_tables(FolderCheck({"train": [check]}, ()))[1])
-    rows = [line for line in console.export_text().splitlines() if line.startswith("│")]
-    said = "".join(line.split("│")[1].strip() for line in rows)
-    assert said == name
 
 
 def test_one_room(shards):
