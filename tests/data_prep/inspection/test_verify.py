@@ -15,7 +15,6 @@ from data_prep.engine.build import Job, build_shards
 from data_prep.inspection.sheet import draw_sheet, legend
 from data_prep.inspection.tables import count_tables, room_table
 from data_prep.inspection.verify import verify
-from data_prep.readers.posed.source import PosedSource
 from sceneprior.core.boxes import yaw_rotation
 
 RULES = ("views.per_m2=1.5", "views.image_size=[120, 160]")
