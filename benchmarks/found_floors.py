@@ -25,8 +25,8 @@ from tracks import NOISES, moved, observed, rooms
 from data_prep.front.houses import house_files, read_house
 from data_prep.front.models import ModelBank
 from data_prep.front.recipe import load_recipe
-from sceneprior.core.found_floor import Door, Wall, find_floor
 from sceneprior.core.shards import RoomViews
+from sceneprior.core.wall_lines import Door, Wall, find_walls, seen_floor
 
 NEAR_M = 0.05
 DOOR_M = 0.15
@@ -40,9 +40,6 @@ class Score(NamedTuple):
     """Share of the true floor that some view shows."""
     beyond_m2: float
     """Area of the seen floor outside the true floor."""
-    iou: float
-    """IoU of the true floor and the floor between the found walls."""
-    iou_seen: float
     walls: int
     errors_m: tuple[float, ...]
     stated_m: tuple[float, ...]
@@ -58,30 +55,24 @@ class Score(NamedTuple):
 def score(views: RoomViews, floor_m: np.ndarray, doors: list[np.ndarray]) -> Score:
     """Find a room's floor, walls and doors, and compare them with the ground truth."""
     start = time.process_time()
-    found = find_floor(views)
+    seen, (walls, found_doors) = seen_floor(views), find_walls(views)
     seconds = time.process_time() - start
     true = shapely.Polygon(floor_m)
     sides = np.stack([floor_m, np.roll(floor_m, -1, axis=0)], axis=1)
     sides = sides[np.linalg.norm(sides[:, 1] - sides[:, 0], axis=1) > 0.3]
     return Score(
-        found.seen.intersection(true).area / true.area,
-        found.seen.difference(true).area,
-        _iou(found.floor, true),
-        _iou(found.seen, true),
-        len(found.walls),
-        tuple(_error(wall, sides) for wall in found.walls),
-        tuple(wall.error_m for wall in found.walls),
+        seen.intersection(true).area / true.area,
+        seen.difference(true).area,
+        len(walls),
+        tuple(_error(wall, sides) for wall in walls),
+        tuple(wall.error_m for wall in walls),
         len(sides),
-        sum(_covered(side, found.walls) > 0.5 for side in sides),
-        len(found.doors),
+        sum(_covered(side, walls) > 0.5 for side in sides),
+        len(found_doors),
         len(doors),
-        sum(any(_same(door, ends) for door in found.doors) for ends in doors),
+        sum(any(_same(door, ends) for door in found_doors) for ends in doors),
         seconds,
     )
-
-
-def _iou(one: shapely.Geometry, other: shapely.Geometry) -> float:
-    return one.intersection(other).area / max(one.union(other).area, 1e-9)
 
 
 def _error(wall: Wall, sides: np.ndarray) -> float:
@@ -159,13 +150,10 @@ def rows(scores: list[Score]) -> Iterator[str]:
         errors = np.array([error for each in chosen for error in each.errors_m])
         stated = np.array([error for each in chosen for error in each.stated_m])
         worst_cm = np.quantile(errors, 0.95, method="higher") * 100
-        iou = np.array([each.iou for each in chosen])
-        sums = {key: sum(getattr(each, key) for each in chosen) for key in Score._fields[7:12]}
+        sums = {key: sum(getattr(each, key) for each in chosen) for key in Score._fields[5:10]}
         yield (
             f"| {name} ({len(chosen)}) | {np.mean([each.seen for each in chosen]):.2f} "
             f"| {np.mean([each.beyond_m2 for each in chosen]):.3f} "
-            f"| {np.mean([each.iou_seen for each in chosen]):.3f} | {iou.mean():.3f} "
-            f"| {np.median(iou):.3f} | {np.mean(iou >= 0.9):.2f} "
             f"| {np.median(errors) * 100:.1f}, {worst_cm:.1f} "
             f"| {np.mean(errors <= NEAR_M):.3f} | {np.median(stated) * 100:.1f} "
             f"| {sums['sides_found']} / {sums['sides']} "
@@ -194,10 +182,10 @@ def main() -> None:
         if options.each:
             print(place, views.room_id, scores[-1], flush=True)
     print(
-        "| rooms | seen | beyond, m2 | IoU seen | IoU floor | median | at least 0.9 "
+        "| rooms | seen | beyond, m2 | "
         "| wall error, 95%, cm | within 5 cm | stated, cm | sides | doors (found) | s |"
     )
-    print("| --- " * 13 + "|")
+    print("| --- " * 9 + "|")
     print("\n".join(rows(scores)))
 
 

@@ -41,7 +41,7 @@ MAY_TOO = {
 
 BUDGET = {
     "data_prep": (13743, 110),
-    "sceneprior/core": (5897, 35),
+    "sceneprior/core": (5757, 34),
     "sceneprior/furniture": (586, 4),
     "sceneprior/render": (4596, 36),
     "sceneprior/training": (929, 9),

@@ -11,8 +11,8 @@ from data_prep.inspection.agreement import NEAR_M
 from sceneprior.core.boxes import BOX_EDGES, box_corners
 from sceneprior.core.cameras import camera_centers, to_camera, to_pixels
 from sceneprior.core.classes import class_colors, label_set
-from sceneprior.core.found_floor import find_floor
 from sceneprior.core.shards import RoomGroundTruth, RoomViews, Shard
+from sceneprior.core.wall_lines import find_walls, seen_floor
 from sceneprior.render.pictures import paint_ids
 
 BACKGROUND = (246, 246, 246)
@@ -119,9 +119,8 @@ def draw_plan(shard: Shard, room_id: str, width_px: int = 480, height_px: int = 
 
     picture = Image.new("RGB", (width_px, height_px), BACKGROUND)
     draw = ImageDraw.Draw(picture)
-    found = find_floor(room) if has_stuff else None
-    if found is not None:
-        for part in shapely.get_parts(found.seen):
+    if has_stuff:
+        for part in shapely.get_parts(seen_floor(room)):
             draw.polygon([at(*point) for point in part.exterior.coords], fill=FLOOR)
             for hole in part.interiors:
                 draw.polygon([at(*point) for point in hole.coords], fill=BACKGROUND)
@@ -142,8 +141,8 @@ def draw_plan(shard: Shard, room_id: str, width_px: int = 480, height_px: int = 
             _tag(
                 draw, (corners[0] + 2, corners[1] + 2), label, _dark(colors[truth.object_class[k]])
             )
-    if found is not None:
-        for lines, color in ((found.walls, WALL), (found.doors, DOOR)):
+    if has_stuff:
+        for lines, color in zip(find_walls(room), (WALL, DOOR), strict=True):
             for line in lines:
                 draw.line((*at(*line.start_m), *at(*line.end_m)), fill=color, width=4)
     for matrix in room.world_to_camera.astype(np.float64):

@@ -14,51 +14,12 @@ from sceneprior.core.errors import ConfigError
 from sceneprior.core.files import write_whole
 
 MOST_BYTES = 2**20
-MOST_VALUES = 20_000
-"""Maximum number of values in a settings file; an alias counts as all values that it stands for,
-and a long text as one more value per 100 characters."""
-MOST_BITS = 4000
-"""Maximum size of an integer; Python refuses to print longer ones, even in a message."""
-MOST_LEVELS = 30
-"""Maximum nesting depth of sections; ours have five levels."""
+"""Maximum size of a settings file."""
 
 
 class _Loader(yaml.SafeLoader):
-    """Safe YAML loader that also accepts 3e-4 as a number (YAML 1.1 requires 3.0e-4).
+    """Safe YAML loader that also accepts 3e-4 as a number (YAML 1.1 requires 3.0e-4)."""
 
-    Files with too many values or levels raise a YAMLError, because a few nested aliases may expand
-    to billions of values, and deep nesting exceeds Python's recursion limit.
-    """
-
-    def __init__(self, text: str) -> None:
-        super().__init__(text)
-        self.values = self.level = 0
-        self.size_of: dict[yaml.Node, int] = {}
-
-    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        before, self.level = self.values, self.level + 1
-        if self.level > MOST_LEVELS:
-            raise yaml.YAMLError(f"it has more than {MOST_LEVELS} sections within each other")
-        is_alias = self.check_event(yaml.AliasEvent)
-        node = super().compose_node(parent, index)
-        if is_alias and node not in self.size_of:
-            raise yaml.YAMLError("it has an alias that stands for a part of itself")
-        long = len(node.value) // 100 if isinstance(node, yaml.ScalarNode) else 0
-        self.values += self.size_of[node] if is_alias else 1 + long
-        if self.values > MOST_VALUES:
-            raise yaml.YAMLError(f"it has more than {MOST_VALUES:,} values")
-        self.size_of.setdefault(node, self.values - before)
-        self.level -= 1
-        return node
-
-    def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
-        value: int = super().construct_yaml_int(node)
-        if value.bit_length() > MOST_BITS:
-            raise yaml.YAMLError(f"it has a number of more than {MOST_BITS:,} bits")
-        return value
-
-
-_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
 
 _Loader.add_implicit_resolver(
     "tag:yaml.org,2002:float",
@@ -130,7 +91,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise ConfigError(f"{path} cannot be read ({error.strerror}).") from None
     # Python itself raises a ValueError for invalid dates and for numbers of thousands of digits.
-    except (ValueError, yaml.YAMLError) as error:
+    except (ValueError, RecursionError, yaml.YAMLError) as error:
         raise ConfigError(f"{path} is not a YAML file: {shortened(error)}") from None
     if not isinstance(data, dict):
         raise ConfigError(f"{path} holds no settings; expected `section:` and `key: value` lines.")
@@ -164,7 +125,7 @@ def apply_override(data: dict[str, Any], override: str, option: str = "--set") -
             raise ConfigError(f"{option} {override}: '{parent}' is a value, not a section.")
     try:
         node[last] = yaml.load(text, _Loader)
-    except (ValueError, yaml.YAMLError):
+    except (ValueError, RecursionError, yaml.YAMLError):
         raise ConfigError(
             f"{option} {shortened(override)}: '{shortened(text)}' is not a YAML value."
         ) from None

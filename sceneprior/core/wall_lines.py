@@ -1,15 +1,18 @@
-"""Finds the bases of walls and doors, where floor meets wall in images of stuff, without depth.
+"""Finds the floor that views show, and the bases of walls and doors, in images of stuff.
 
-The floor is the plane y = 0, so a pixel on the lower edge of a wall is one point of the room.
+The floor is the plane y = 0, so a pixel of it, or on the lower edge of a wall, is one point of the
+room without any depth.
 """
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import shapely
 from jaxtyping import Bool, Float, Int
+from scipy import ndimage
 
-from sceneprior.core.cameras import camera_centers, pixel_rays
+from sceneprior.core.cameras import camera_centers, pixel_rays, to_camera
 from sceneprior.core.classes import STUFF
 from sceneprior.core.shards import RoomViews, stuff_step, thinned_intrinsics
 
@@ -33,6 +36,8 @@ _DIRECTIONS, _OFFSET_M = 180, 0.04
 """Number of directions of normals, and bin width of offsets, in the search for walls."""
 _MOST_LINES, _MOST_POINTS, _LEAST_POINTS = 24, 6000, 12
 _BIN_M = 0.05
+CELL_M = 0.03
+"""Side of the cells in which the seen floor is collected."""
 _ERROR_PX = 2.0
 """Additional distance in pixels, along its ray, at which a point still belongs to a found line."""
 _PIXEL_ERROR_M = 0.01
@@ -88,6 +93,44 @@ class _Line(NamedTuple):
         within_m = NEAR_M + pixels * edges.weight**-0.5 * facing
         near = np.abs(edges.points_m @ self.normal - self.offset_m) < within_m
         return near & (facing > 0)
+
+
+def seen_floor(room: RoomViews) -> shapely.Geometry:
+    """The floor (x, z) that some view of a room with `stuff` shows, part of the true floor."""
+    assert room.stuff is not None
+    _, height, width = room.stuff.shape
+    poses = room.world_to_camera.astype(np.float64)
+    intrinsics = thinned_intrinsics(room.intrinsics, stuff_step(room.image_size))
+    views = list(zip(room.stuff, poses, intrinsics, strict=True))
+    corners = []
+    for stuff, pose, K in views:
+        rows, columns = np.nonzero(stuff[::4, ::4] == FLOOR)
+        points_m, length_m, _ = on_floor(np.stack([columns, rows], axis=1) * 4 + 0.5, pose, K)
+        corners.append(points_m[length_m < 2 * COARSE_M])
+    points_m = np.concatenate([*corners, np.zeros((1, 2))])
+    low = points_m.min(axis=0) - 2 * CELL_M
+    shape = np.ceil((points_m.max(axis=0) + 2 * CELL_M - low) / CELL_M).astype(int)
+    middles = low + CELL_M * (np.argwhere(np.ones(shape, dtype=bool)) + 0.5)
+    ground = np.insert(middles, 1, 0.0, axis=1)
+    floor = np.zeros(len(ground), dtype=bool)
+    for stuff, pose, K in views:
+        camera = to_camera(ground, pose)
+        depth = np.maximum(camera[:, 2], 1e-6)
+        u = np.floor(K[0, 0] * camera[:, 0] / depth + K[0, 2])
+        v = np.floor(K[1, 1] * camera[:, 1] / depth + K[1, 2])
+        there = np.flatnonzero(
+            (camera[:, 2] > 0.05) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+        )
+        # A pixel at the edge of the floor also covers other surfaces.
+        inner = ndimage.binary_erosion(stuff == FLOOR, border_value=1)
+        floor[there] |= inner[v[there].astype(int), u[there].astype(int)]
+    # One rectangle for each run of cells along z.
+    edges = np.diff(np.pad(floor.reshape(shape), ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    rows, starts = np.nonzero(edges == 1)
+    _, ends = np.nonzero(edges == -1)
+    near = low[:, None] + CELL_M * np.stack([rows, starts])
+    far = low[:, None] + CELL_M * np.stack([rows + 1, ends])
+    return shapely.union_all(shapely.box(*near, *far))
 
 
 def find_walls(

@@ -8,7 +8,8 @@ import shapely
 from rooms_of_walls import DOOR, L_SHAPE, shell_room
 
 from sceneprior.core.classes import STUFF
-from sceneprior.core.wall_lines import COARSE_M, find_walls, on_floor
+from sceneprior.core.shards import stuff_step, thinned_intrinsics
+from sceneprior.core.wall_lines import COARSE_M, find_walls, on_floor, seen_floor
 
 EYES = [(-1.0, 0.5), (-1.2, -0.8), (0.9, -0.7)]
 TURNED = [(1.2 * x - 0.5 * z, 0.5 * x + 1.2 * z) for x, z in L_SHAPE]
@@ -92,3 +93,23 @@ def test_points_on_the_floor_project_onto_their_pixels():
         if length < COARSE_M and abs(pixel[0] - K[0, 2]) < 5:
             (further,), _, _ = on_floor(pixel[None] - [[0, 0.01]], pose, K)
             assert np.hypot(*(further - (x, z))) == pytest.approx(0.01 * length, rel=0.3)
+
+
+def test_the_seen_floor_is_where_some_view_shows_floor():
+    """Cell by cell, from its definition."""
+    room = shell_room(L_SHAPE, EYES[:1], block=(-0.6, 0.2, 0.3, 1.5))
+    found = seen_floor(room)
+    rng = np.random.default_rng(0)
+    K = thinned_intrinsics(room.intrinsics[0], stuff_step(room.image_size))
+    wrong = 0
+    for x, z in rng.uniform((-2.5, -2), (2.5, 2), (300, 2)):
+        shown = False
+        for stuff, pose in zip(room.stuff, room.world_to_camera.astype(float), strict=True):
+            u, v, depth = K @ (pose @ [x, 0, z, 1])[:3]
+            row, column = int(v // max(depth, 1e-9)), int(u // max(depth, 1e-9))
+            there = 0 <= row < stuff.shape[0] and 0 <= column < stuff.shape[1] and depth > 0
+            shown |= bool(there and stuff[row, column] == STUFF.index("floor"))
+        wrong += shown != found.contains(shapely.Point(x, z))
+    assert wrong < 15  # at the rim of the floor, by the size of pixels and cells
+    blank = replace(room, stuff=np.where(room.stuff == STUFF.index("floor"), 0, room.stuff))
+    assert seen_floor(blank).is_empty and find_walls(blank) == ((), ())
