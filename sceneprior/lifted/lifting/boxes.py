@@ -137,8 +137,11 @@ def own_rays(
     """
     each = max(4, RAYS // len(poses))
     origins, directions = [], []
-    for ids, pose, camera, clear in zip(seen.ids, poses, intrinsics, sides_clear, strict=True):
-        v, u = np.nonzero(ids == seen.own_id)
+    for ids, (x1, y1, x2, y2), pose, camera, clear in zip(
+        seen.ids, seen.boxes_px, poses, intrinsics, sides_clear, strict=True
+    ):
+        v, u = np.nonzero(ids[y1:y2, x1:x2] == seen.own_id)
+        v, u = v + y1, u + x1
         outermost = np.array([u.argmin(), v.argmin(), u.argmax(), v.argmax()])[clear]
         picked = np.concatenate([rng.integers(len(u), size=each), outermost])
         rays = pixel_directions(u[picked], v[picked], pose, camera)

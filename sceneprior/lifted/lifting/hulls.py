@@ -102,7 +102,7 @@ def carve(
     """
     emptiness = np.empty((cells, cells, cells), dtype=np.float32)
     in_threads(
-        _carve, cells, seen.ids, seen.boxes_px, seen.own_before, seen.table_starts,
+        _carve, cells, seen.ids, seen.own_id, seen.boxes_px, seen.own_before, seen.table_starts,
         seen.world_to_image, seen.focal_px, low_m, high_m, reach, most_empty, emptiness,
     )  # fmt: skip
     return Hull(low_m, high_m, emptiness)
@@ -186,8 +186,8 @@ def own_in(box_px, table, start, x1, y1, x2, y2):
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def _carve(
-    first, last, ids, boxes_px, table, starts, matrices, focal_px, low_m, high_m, reach, most_empty,
-    emptiness,
+    first, last, ids, own_id, boxes_px, table, starts, matrices, focal_px, low_m, high_m, reach,
+    most_empty, emptiness,
 ):  # fmt: skip
     views, height, width = ids.shape
     cells = emptiness.shape[0]
@@ -219,13 +219,14 @@ def _carve(
                     if not (0 <= u[k] < width and 0 <= v[k] < height):
                         continue
                     column, row = int(u[k]), int(v[k])
+                    here = ids[view, row, column]
                     radius = int(radius_m * focal_px[view] / depth[k] + 0.5)
-                    if own_in(
+                    if here == own_id or own_in(
                         box, table, start,
                         column - radius, row - radius, column + radius + 1, row + radius + 1,
                     ):  # fmt: skip
                         own[j, k] += 1
-                    elif ids[view, row, column] == 0:
+                    elif here == 0:
                         past[j, k] += 1
         for j in range(cells):
             for k in range(cells):

@@ -5,9 +5,11 @@ change is kept; the search ends when no change lowers the loss (`part_loss.py`).
 """
 
 from collections.abc import Iterator
+from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool
+from numba import njit
 from scipy import ndimage
 
 from sceneprior.core.parts import (
@@ -135,20 +137,26 @@ def _changes(
             yield {new: (BOX, across, own)}
 
 
-def _extents_of(
-    hull: Bool[np.ndarray, "x y z"], ends: Int[np.ndarray, "3 2"]
-) -> Int[np.ndarray, "3 2"]:
+# no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.
+@njit(cache=True, nogil=True)
+@no_type_check
+def _extents_of(hull, ends):
     """The bounding box of the hull's cells in a box; the box itself if it has none."""
     cells = len(hull)
     first, last = ends[:, 0] * cells // LEVELS, -(-ends[:, 1] * cells // LEVELS)
-    inner = hull[first[0] : last[0], first[1] : last[1], first[2] : last[2]]
-    if not inner.any():
-        return ends
+    low, high = last.copy(), first - 1
+    for x in range(first[0], last[0]):
+        for y in range(first[1], last[1]):
+            for z in range(first[2], last[2]):
+                if hull[x, y, z]:
+                    low[0], high[0] = min(low[0], x), max(high[0], x)
+                    low[1], high[1] = min(low[1], y), max(high[1], y)
+                    low[2], high[2] = min(low[2], z), max(high[2], z)
     found = ends.copy()
-    for axis in range(3):
-        filled = first[axis] + np.flatnonzero(inner.any(axis=tuple({0, 1, 2} - {axis})))
-        found[axis, 0] = max(ends[axis, 0], filled[0] * LEVELS // cells)
-        found[axis, 1] = min(ends[axis, 1], -(-(filled[-1] + 1) * LEVELS // cells))
+    if high[0] >= low[0]:
+        for axis in range(3):
+            found[axis, 0] = max(ends[axis, 0], low[axis] * LEVELS // cells)
+            found[axis, 1] = min(ends[axis, 1], -(-(high[axis] + 1) * LEVELS // cells))
     return found
 
 
