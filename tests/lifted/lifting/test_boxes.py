@@ -89,7 +89,7 @@ def test_rays_go_through_the_objects_own_pixels(rooms):
     seen = sightings_of(views, rows, item)
     checked = 0
     for row, (view, clear) in enumerate(zip(rows, views.sides_clear[rows, item], strict=True)):
-        one = seen._replace(ids=seen.ids[row : row + 1])
+        one = seen._replace(ids=seen.ids[row : row + 1], boxes_px=seen.boxes_px[row : row + 1])
         pose, camera = views.world_to_camera[view].astype(float), views.intrinsics[view]
         origins, directions = own_rays(
             one, pose[None], camera[None], clear[None], np.random.default_rng(0)
