@@ -29,13 +29,13 @@ from sceneprior.lifted.prototypes import (
     POSES,
     Prototypes,
     embed_posed,
+    pose_rotation,
     turn_of,
     turned_extents,
 )
 from sceneprior.lifted.rooms import PosedScenes
 from sceneprior.lifted.shape_morphing import (
     appearances_of,
-    pose_rotation,
     posed_parts,
     stretched_parts,
 )

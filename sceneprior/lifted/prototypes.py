@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from sceneprior.core.boxes import QUARTERS, turn_grids
+from sceneprior.core.boxes import QUARTERS, quarter_rotation, turn_grids
 from sceneprior.core.parts import Parts
 
 POSES = 2 * QUARTERS
@@ -161,6 +161,16 @@ def pose_distances(
 def turn_of(pose: int) -> tuple[int, bool]:
     """Quarter turns and mirroring of a pose, as arguments of `turn_grids`."""
     return pose % QUARTERS, pose >= QUARTERS
+
+
+def pose_rotation(pose: int) -> Float[np.ndarray, "3 3"]:
+    """The matrix of a pose: a mirror image (x reversed) if the pose has one, then quarter turns.
+
+    Its entries are 0 and +-1.
+    """
+    quarters, mirrored = turn_of(pose)
+    rotation: np.ndarray = quarter_rotation(quarters) * ([-1, 1, 1] if mirrored else [1, 1, 1])
+    return rotation
 
 
 def turned_extents(extents: Float[np.ndarray, "n 3"], pose: int) -> Float[np.ndarray, "n 3"]:

@@ -5,9 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sceneprior.core.boxes import quarter_rotation
 from sceneprior.core.parts import SQUARE, Parts, Stretch
-from sceneprior.lifted.prototypes import turn_of
+from sceneprior.lifted.prototypes import pose_rotation, turn_of
 
 HOLD = 0.125
 """Minimum share of the path that a look between two others must hold to be shown. A smaller value
@@ -59,16 +58,6 @@ def appearances_of(
         shown = [(ends[0], looks[steps[0]]), *between, (ends[1], looks[steps[-1]])]
         found.append(Appearance(*map(np.array, zip(*shown, strict=True))))
     return found
-
-
-def pose_rotation(pose: int) -> Float[np.ndarray, "3 3"]:
-    """The matrix of a pose: a mirror image (x reversed) if the pose has one, then quarter turns.
-
-    Its entries are 0 and +-1.
-    """
-    quarters, mirrored = turn_of(pose)
-    rotation: np.ndarray = quarter_rotation(quarters) * ([-1, 1, 1] if mirrored else [1, 1, 1])
-    return rotation
 
 
 def posed_parts(parts: Parts, pose: int) -> Parts:

@@ -30,13 +30,15 @@ from numba import njit
 
 from sceneprior.core.parts import BOX, SQUARE, Parts
 from sceneprior.lifted.lifting import RayPool
-from sceneprior.lifted.lifting.outlines import area_table, cut_rays, points_within
-from sceneprior.lifted.lifting.part_rays import descend, meets, wrong_rays
+from sceneprior.lifted.lifting.part_rays import descend, meets
 from sceneprior.lifted.lifting.part_regularizers import (
     LEVELS,
+    area_table,
     count_planes,
+    cut_rays,
     gap_and_pieces,
     overhang,
+    points_within,
     volume_of,
 )
 
@@ -168,7 +170,10 @@ class RayFit:
 def _loss(kinds, mirrored, ends, met_by, hits, hit_price, miss_price, area, hangs):
     """The loss of parts, of which each ray meets `met_by`; compiled as one, since it is computed
     thousands of times for each prototype."""
-    missed, wrongly_met = wrong_rays(met_by, hits)
+    missed, wrongly_met = 0, 0
+    for ray in range(len(hits)):
+        missed += hits[ray] and met_by[ray] == 0
+        wrongly_met += not hits[ray] and met_by[ray] > 0
     volume, curved = 0.0, 0
     for part in range(len(kinds)):
         volume += volume_of(kinds[part], mirrored[part], ends[part])

@@ -10,8 +10,7 @@ import numpy as np
 from numba import njit
 
 from sceneprior.core.parts import ACROSS_X, ACROSS_Z, BOWL, BOX, CYLINDER, DOME
-from sceneprior.lifted.lifting.outlines import within
-from sceneprior.lifted.lifting.part_regularizers import LEVELS, planes_of, volume_of
+from sceneprior.lifted.lifting.part_regularizers import LEVELS, planes_of, volume_of, within
 
 FAR = 1e6
 """A level beyond all rays."""
@@ -136,19 +135,6 @@ def _face_costs(
         place = step if upper else LEVELS - step
         total += costs[place]
         costs[place] = total
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-@no_type_check
-def wrong_rays(count, hits):
-    """Number of hits that meet no part, and of misses that meet one."""
-    missed, wrongly_met = 0, 0
-    for ray in range(len(hits)):
-        if hits[ray]:
-            missed += count[ray] == 0
-        else:
-            wrongly_met += count[ray] > 0
-    return missed, wrongly_met
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

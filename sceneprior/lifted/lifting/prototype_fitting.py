@@ -7,7 +7,6 @@ from jaxtyping import Bool, Float, Int
 from rich.console import Console
 from rich.progress import track
 
-from sceneprior.core.boxes import quarter_rotation
 from sceneprior.core.parts import Parts
 from sceneprior.lifted.lifting import RayPool
 from sceneprior.lifted.lifting.part_fit import fit_parts
@@ -17,7 +16,7 @@ from sceneprior.lifted.prototypes import (
     POSES,
     Prototypes,
     pose_distances,
-    turn_of,
+    pose_rotation,
     turned_extents,
 )
 from sceneprior.render.silhouettes.cpu.kernels import in_threads, thread_count
@@ -81,9 +80,7 @@ def fit_prototypes(
 
 def as_prototype(rays: RayPool, pose: int) -> RayPool:
     """Transform an object's rays to the frame of a prototype that the object shows in this pose."""
-    quarters, mirrored = turn_of(pose)
-    back = quarter_rotation(quarters) * [-1 if mirrored else 1, 1, 1]
-    starts, spans = (part.astype(np.float64) @ back for part in rays[:2])
+    starts, spans = (part.astype(np.float64) @ pose_rotation(pose) for part in rays[:2])
     return RayPool(starts, spans, rays.hits)
 
 

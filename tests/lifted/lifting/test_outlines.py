@@ -5,7 +5,7 @@ import pytest
 import shapely
 
 from sceneprior.core.parts import MOST_CORNERS, SQUARE
-from sceneprior.lifted.lifting.outlines import cut_rays, outline_of, points_within
+from sceneprior.lifted.lifting.part_regularizers import cut_rays, outline_of, points_within
 
 L_SHAPE = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.0], [0.0, 0.0], [0.0, 0.5], [-0.5, 0.5]])
 CELLS = 30

@@ -15,12 +15,9 @@ from sceneprior.core.parts import (
     surface_of_parts,
 )
 from sceneprior.lifted.lifting import RayPool
-from sceneprior.lifted.lifting.outlines import area_table
-from sceneprior.lifted.lifting.part_fit import fit_parts
+from sceneprior.lifted.lifting.part_fit import close_slits, fit_parts, supports
 from sceneprior.lifted.lifting.part_loss import RayFit
-from sceneprior.lifted.lifting.part_regularizers import gap_and_pieces, overhang
-from sceneprior.lifted.lifting.part_repair import closed as without_slits
-from sceneprior.lifted.lifting.part_repair import supports
+from sceneprior.lifted.lifting.part_regularizers import area_table, gap_and_pieces, overhang
 
 MARGIN, CELLS = 1.1, 32
 
@@ -79,7 +76,7 @@ def test_a_narrow_slit_between_a_part_and_its_image_is_closed_unless_rays_pass_i
         if not count:
             rays = rays._replace(hits=np.ones(40, bool))
         fit = RayFit(rays, MARGIN)
-        found = without_slits(fit, fit.guess(halves.kind, halves.mirrored, ends))
+        found = close_slits(fit, fit.guess(halves.kind, halves.mirrored, ends))
         assert (found.mirrored[0] == 0) == closed
         assert found.ends[0, 0].tolist() == ([0, 64] if closed else [0, 30])
 

@@ -5,11 +5,11 @@ import pytest
 from parts_of_rooms import TABLE, rays_of
 
 from sceneprior.core.parts import ACROSS_X, ACROSS_Z, BOX, SQUARE, Parts, inside
-from sceneprior.lifted.lifting.outlines import area_table
 from sceneprior.lifted.lifting.part_loss import RayFit
 from sceneprior.lifted.lifting.part_rays import count_wrong, descend, meets
 from sceneprior.lifted.lifting.part_regularizers import (
     LEVELS,
+    area_table,
     gap_and_pieces,
     overhang,
     planes_of,
