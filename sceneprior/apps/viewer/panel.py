@@ -126,7 +126,7 @@ class Panel:
             gui.add_button("Make room").on_click(lambda _: page.safely(sample))
             gui.add_button("Next seed").on_click(lambda _: page.safely(another))
             if explorer.takes_requests:
-                again: Any = gui.add_number("Seed ", 0, min=0, step=1)
+                again: Any = gui.add_number("Completion", 0, min=0, step=1, hint="Its seed")
                 complete = gui.add_button(
                     "Complete the rest",
                     hint="Click objects to keep them; all others are replaced by new ones",
