@@ -3,7 +3,7 @@
 import hashlib
 from collections.abc import Container, Sequence
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import distributions, version
 from pathlib import Path
 from typing import Any
 
@@ -223,10 +223,5 @@ def result_of(columns: dict[str, dict[str, Estimate]]) -> dict[str, Any]:
 
 def _package_versions() -> dict[str, str]:
     """The version of every package that a result depends on."""
-    found = {}
-    for name in _PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+    known = {name for name in _PACKAGES if any(True for _ in distributions(name=name))}
+    return {name: version(name) if name in known else "not installed" for name in _PACKAGES}

@@ -46,22 +46,14 @@ class UseOptions:
             )
 
 
-@dataclass(frozen=True)
-class Used:
-    """Metrics of use by set of rooms and key, and why others are left out."""
-
-    columns: dict[str, dict[str, Estimate]]
-    left_out: dict[str, str]
-    """For each metric left out, what the generated rooms lack."""
-
-
 def measure_use(
     sets: Mapping[str, Sequence[Scene]], seed: int, resamples: int, options: UseOptions
-) -> Used:
+) -> tuple[dict[str, dict[str, Estimate]], dict[str, str]]:
     """Compute all metrics of use for sets of rooms, with intervals over rooms.
 
-    A metric is left out of all sets, with the reason, if no generated room has what it needs (a
-    floor, doors or windows).
+    Returns:
+        The metrics by set and key; and the metrics that are left out of all sets, each with what
+        no generated room has (a floor, doors or windows).
     """
     columns = {}
     total = sum(map(len, sets.values()))
@@ -80,7 +72,7 @@ def measure_use(
     for found in columns.values():
         for key in reasons:
             del found[key]
-    return Used(columns, reasons)
+    return columns, reasons
 
 
 def measure_room(scene: Scene, options: UseOptions) -> Counts:
@@ -117,18 +109,6 @@ def _reason(metric: Metric, scenes: Sequence[Scene], options: UseOptions) -> str
     return metric.needs
 
 
-def real_and_random(shards: Path, split: str, count: int, seed: int) -> dict[str, Sequence[Scene]]:
-    """The real rooms of a split, and `count` shuffled and independent rooms, with meshes, floors
-    and ceilings; the layouts are those of `evaluate_synthesis`."""
-    every_train = reference_scenes(shards, "train")
-    count = min(count, len(every_train))
-    return {
-        "test": reference_scenes(shards, split),
-        "shuffled": shuffled_rooms(every_train, count, seed, with_meshes=True),
-        "independent": independent_rooms(every_train, count, seed, with_meshes=True),
-    }
-
-
 def evaluate_use(
     generated: Sequence[Scene],
     options: EvalOptions,
@@ -153,27 +133,24 @@ def evaluate_use(
         generated = [make_stable(scene)[0] for scene in generated]
     sets: dict[str, Sequence[Scene]] = {"generated": generated}
     if shards is not None:
-        sets |= real_and_random(shards, options.split, len(generated), options.seed)
+        every_train = reference_scenes(shards, "train")
+        count = min(len(generated), len(every_train))
+        sets["test"] = reference_scenes(shards, options.split)
+        for name, make in (("shuffled", shuffled_rooms), ("independent", independent_rooms)):
+            sets[name] = make(every_train, count, options.seed, with_meshes=True)
         common_label_set(generated, sets["test"])
-    found = measure_use(sets, options.seed, options.resamples, use)
-    measured = result_of(found.columns)
+    columns, left_out = measure_use(sets, options.seed, options.resamples, use)
     if scores is None:
+        settings = {"seed": options.seed, "resamples": options.resamples, "intervals": METHOD}
         scores = {
-            "format": FORMAT,
-            "version": VERSION,
-            "protocol": {
-                "label_set": names,
-                "seed": options.seed,
-                "resamples": options.resamples,
-                "intervals": METHOD,
-            },
-        }
-    result = merged(dict(scores), measured)
+            "format": FORMAT, "version": VERSION, "protocol": {"label_set": names, **settings}
+        }  # fmt: skip
+    result = merged(dict(scores), result_of(columns))
     floors = sum(scene.floor_m is not None for scene in generated)
     result["protocol"] = {
         **scores["protocol"],
         **{f"n_{name}": len(scenes) for name, scenes in sets.items()},
-        "left_out": {**scores["protocol"].get("left_out", {}), **found.left_out},
+        "left_out": {**scores["protocol"].get("left_out", {}), **left_out},
         "use": {
             **{name: entry for metric in USE for name, entry in metric.protocol.items()},
             "settle": use.settle,
@@ -183,16 +160,11 @@ def evaluate_use(
         },
     }
     if 0 < floors < len(generated):
-        result["note"] = " ".join(
-            filter(
-                None,
-                (
-                    f"{len(generated) - floors} of {len(generated)} generated rooms have no floor, "
-                    "and are left out of the metrics that need one.",
-                    scores.get("note"),
-                ),
-            )
+        note = (
+            f"{len(generated) - floors} of {len(generated)} generated rooms have no floor, and are "
+            "left out of the metrics that need one."
         )
+        result["note"] = " ".join(filter(None, (note, scores.get("note"))))
     return result
 
 

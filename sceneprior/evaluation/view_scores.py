@@ -3,14 +3,13 @@ distance, F-score and box IoU."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import shapely
 import trimesh
 from jaxtyping import Float
 
-from sceneprior.core.boxes import yaw_rotation
 from sceneprior.core.errors import InputError
 from sceneprior.core.overlaps import box_iou_3d
 from sceneprior.core.scene import Mesh, SceneObject
@@ -56,56 +55,29 @@ def f_score(
     return 2 * precision * recall / max(precision + recall, 1e-12)
 
 
-class OrientedBox(NamedTuple):
-    """An upright box, rotated about the vertical axis."""
-
-    center_m: Float[np.ndarray, "3"]
-    size_m: Float[np.ndarray, "3"]
-    """Full extents along the box's own x, y and z."""
-    yaw_rad: float
-    """Rotation that turns +z towards +x (docs/conventions.md)."""
-
-
-def oriented_box(mesh: Mesh) -> OrientedBox:
-    """The tightest upright box around a mesh, over the footprint's rectangle of least area.
-
-    The yaw is in [0, pi / 2): the front of a mesh is unknown, and the IoU does not depend on it.
-    For a mesh that is an upright box, the result is that box.
-    """
-    points = np.asarray(mesh.vertices_m, dtype=np.float64)
-    rectangle = shapely.MultiPoint(points[:, [0, 2]]).minimum_rotated_rectangle
-    yaw = 0.0  # any yaw fits a footprint without area
-    if isinstance(rectangle, shapely.Polygon):
-        x, z = np.diff(np.asarray(rectangle.exterior.coords)[:2], axis=0)[0]
-        yaw = float(np.arctan2(x, z) % (np.pi / 2))
-    turn = yaw_rotation(yaw)
-    own = points @ turn  # columns of `turn` are the box's axes
-    low, high = own.min(axis=0), own.max(axis=0)
-    return OrientedBox(turn @ (low + high) / 2, high - low, yaw)
-
-
-def oriented_box_iou_3d(a: OrientedBox, b: OrientedBox) -> float:
-    """Intersection over union of two upright boxes: shared footprint x shared height.
-
-    Two boxes without volume have IoU 0. At yaw 0 it equals `box_iou_3d`.
+def upright_box_iou_3d(a: Mesh, b: Mesh) -> float:
+    """Intersection over union of the tightest upright boxes around two meshes, each over the
+    footprint's rectangle of least area; 0 for boxes without volume.
 
     Example: a cube and the same cube turned by 45 degrees share a regular octagon.
 
-        >>> cube = OrientedBox(np.zeros(3), np.ones(3), 0.0)
-        >>> round(oriented_box_iou_3d(cube, cube._replace(yaw_rad=np.pi / 4)), 6)
+        >>> from sceneprior.core.boxes import yaw_rotation
+        >>> from sceneprior.render.appearance import box_mesh
+        >>> cube = box_mesh((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+        >>> turned = Mesh(cube.vertices_m @ yaw_rotation(np.pi / 4), cube.faces)
+        >>> round(upright_box_iou_3d(cube, turned), 6)
         0.707107
     """
-    low, high = ([box.center_m[1] + side * box.size_m[1] / 2 for box in (a, b)] for side in (-1, 1))
-    height = max(min(high) - max(low), 0.0)
-    shared = shapely.intersection(_footprint(a), _footprint(b)).area * height
-    union = a.size_m.prod() + b.size_m.prod() - shared
+    plans, lows, highs = [], [], []
+    for mesh in (a, b):
+        points = np.asarray(mesh.vertices_m, dtype=np.float64)
+        plans.append(shapely.MultiPoint(points[:, [0, 2]]).minimum_rotated_rectangle)
+        lows.append(points[:, 1].min())
+        highs.append(points[:, 1].max())
+    heights = np.subtract(highs, lows)
+    shared = shapely.intersection(*plans).area * max(min(highs) - max(lows), 0.0)
+    union = plans[0].area * heights[0] + plans[1].area * heights[1] - shared
     return float(shared / union) if union > 0 else 0.0
-
-
-def _footprint(box: OrientedBox) -> shapely.Polygon:
-    corners = np.array([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]]) / 2
-    room = (corners * box.size_m) @ yaw_rotation(box.yaw_rad).T + box.center_m
-    return shapely.Polygon(room[:, [0, 2]])
 
 
 RESAMPLES = 1000
@@ -121,55 +93,46 @@ class ObjectPair:
     """The fitted object. If it is None, the true object has IoUs and F-score 0, and no distance."""
 
 
-@dataclass(frozen=True)
-class PairScore:
-    """Scores of one true object."""
-
-    label: str
-    found: bool
-    surface_known: bool
-    """True if the true object has a mesh; without one, only its box and class are scored."""
-    class_right: bool
-    box_iou_3d: float
-    oriented_box_iou_3d: float | None = None
-    chamfer_l2_m: float | None = None
-    chamfer_squared_m2: float | None = None
-    f_score: float | None = None
+PairScore = dict[str, Any]
+"""Scores of one true object by name of `FIELDS`, its `label`, and whether it was `found` and has a
+`surface`. A score is None if it is unknown."""
 
 
 def score_pair(pair: ObjectPair, points: int = POINTS, seed: int = 0) -> PairScore:
-    """Compare two objects in the room frame; a fitted object without a mesh is its box.
+    """Compare two objects in the room frame; a fitted object without a mesh is its box. A true
+    object without a mesh is compared by its box and class alone: compared with a box, a correct
+    shape would score worse than a box.
 
     `points` are sampled from each surface, uniformly by area, with a different seed per surface.
     """
     truth, found = pair.truth, pair.found
     known = truth.mesh is not None
+    worst = 0.0 if known else None
+    score: PairScore = dict.fromkeys(FIELDS) | {
+        "label": truth.label, "found": found is not None, "surface": known, "class_accuracy": False,
+        "box_iou_3d": 0.0, "oriented_box_iou_3d": worst, "f_score": worst,
+    }  # fmt: skip
     if found is None:
-        worst = 0.0 if known else None
-        return PairScore(truth.label, False, known, False, 0.0, worst, f_score=worst)
+        return score
     boxes = (
         np.array([part], dtype=np.float64)
         for item in (truth, found)
         for part in (item.center_m, item.size_m)
     )
-    box_iou, class_right = float(box_iou_3d(*boxes)[0, 0]), found.label == truth.label
-    if truth.mesh is None:  # compared with a box, a correct shape would score worse than a box
-        return PairScore(truth.label, True, False, class_right, box_iou)
+    score["box_iou_3d"] = float(box_iou_3d(*boxes)[0, 0])
+    score["class_accuracy"] = found.label == truth.label
+    if truth.mesh is None:
+        return score
     surfaces = [truth.mesh, object_mesh(found)]
     a, b = (sample_surface(mesh, points, 2 * seed + i) for i, mesh in enumerate(surfaces))
     apart_m = nearest_distances(a, b)
     distance = chamfer_of(*apart_m)
-    return PairScore(
-        label=truth.label,
-        found=True,
-        surface_known=True,
-        class_right=class_right,
-        box_iou_3d=box_iou,
-        oriented_box_iou_3d=oriented_box_iou_3d(*map(oriented_box, surfaces)),
-        chamfer_l2_m=distance.l2_m,
-        chamfer_squared_m2=distance.squared_m2,
-        f_score=f_score(*apart_m),
-    )
+    return score | {
+        "oriented_box_iou_3d": upright_box_iou_3d(*surfaces),
+        "chamfer_l2_m": distance.l2_m,
+        "chamfer_squared_m2": distance.squared_m2,
+        "f_score": f_score(*apart_m),
+    }
 
 
 def score_views(
@@ -187,8 +150,8 @@ def score_views(
     ]
     if not scores:
         raise InputError("No image shows an object, so there is nothing to score.")
-    labels = sorted({score.label for score in scores})
-    by_class = {name: [score for score in scores if score.label == name] for name in labels}
+    labels = sorted({score["label"] for score in scores})
+    by_class = {name: [score for score in scores if score["label"] == name] for name in labels}
     return {
         "summary": {"rooms": len(set(rooms)), "images": len(views), **summary(scores)},
         "intervals": intervals(
@@ -202,14 +165,14 @@ def summary(scores: Sequence[PairScore]) -> dict[str, float | int | None]:
     """Means over the objects that have a value, and the numbers of objects behind them."""
 
     def mean(name: str) -> float | None:
-        known = [value for score in scores if (value := getattr(score, name)) is not None]
+        known = [score[name] for score in scores if score[name] is not None]
         return sum(known) / len(known) if known else None
 
     return {
         "objects": len(scores),
-        "unmatched": sum(not score.found for score in scores),
-        "with_surface": sum(score.surface_known for score in scores),
-        **{name: mean(attribute) for name, attribute in FIELDS.items()},
+        "unmatched": sum(not score["found"] for score in scores),
+        "with_surface": sum(score["surface"] for score in scores),
+        **{name: mean(name) for name in FIELDS},
     }
 
 
@@ -222,8 +185,8 @@ def intervals(scores: Sequence[PairScore], rooms: Sequence[str]) -> dict[str, li
     names, number = np.unique(rooms, return_inverse=True)
     counts = resample_counts(len(names), RESAMPLES, 0)
     found = {}
-    for name, attribute in FIELDS.items():
-        values = [getattr(score, attribute) for score in scores]
+    for name in FIELDS:
+        values = [score[name] for score in scores]
         known = np.bincount(number, [value is not None for value in values])
         sums = np.bincount(number, [value or 0.0 for value in values])
         high = np.inf if name.startswith("chamfer") else 1.0
@@ -244,7 +207,7 @@ def surface_note(objects: int, with_surface: int, shards: str) -> str | None:
     )
 
 
-METRICS = {
+_DEFINITIONS = {
     "box_iou_3d": "axis-aligned boxes in the room frame",
     "oriented_box_iou_3d": "upright boxes around the meshes, over the footprint's rectangle of "
     "least area",
@@ -256,10 +219,10 @@ METRICS = {
 PROTOCOL = {
     "objects": "objects that the image shows, each matched to the object fitted to its mask by the "
     "fit's own assignment (class and 2D box); every object has the same weight",
-    **METRICS,
+    **_DEFINITIONS,
     "intervals": f"{COVERAGE:.0%} bootstrap over rooms, {RESAMPLES:,} draws with replacement, all "
     "views of a room together",
 }
 """The compared objects and the metrics, as described in result files."""
-FIELDS = {**{name: name for name in METRICS}, "class_accuracy": "class_right"}
-"""Metrics of a summary, each the mean of this field of `PairScore`."""
+FIELDS = (*_DEFINITIONS, "class_accuracy")
+"""Metrics of a summary, each a mean over objects."""

@@ -28,14 +28,14 @@ def moved(item: SceneObject, x_m: float) -> SceneObject:
 
 def test_a_box_found_half_aside():
     score = score_pair(ObjectPair(DESK, replace(moved(DESK, 0.5), label="sofa")), POINTS)
-    assert score.box_iou_3d == pytest.approx(1 / 3)
-    assert score.oriented_box_iou_3d == pytest.approx(1 / 3)
-    assert not score.class_right
+    assert score["box_iou_3d"] == pytest.approx(1 / 3)
+    assert score["oriented_box_iou_3d"] == pytest.approx(1 / 3)
+    assert not score["class_accuracy"]
     # Two opposite sides are 0.5 m from the nearest side; of the other four, half of the area
     # lies on the other box's sides, and the rest is up to 0.5 m, 0.25 m on average, away.
     per_way = (0.5 * 1 + 4 * 0.5 * 0.25) / 6
     inside = 0.5  # the side that lies within the other box sees a side half a metre away, too
-    assert 2 * per_way < score.chamfer_l2_m < 2 * (per_way + inside / 6) + 0.05
+    assert 2 * per_way < score["chamfer_l2_m"] < 2 * (per_way + inside / 6) + 0.05
 
 
 def test_every_object_weighs_the_same_and_nothing_found_is_no_number():
@@ -58,10 +58,10 @@ def test_a_box_is_no_surface():
     """A true object without a mesh is compared by box and class; its other scores are None, and the
     scores of other objects stay the same."""
     score = score_pair(ObjectPair(replace(DESK, mesh=None), moved(DESK, 0.5)), POINTS)
-    assert (score.box_iou_3d, score.class_right) == (pytest.approx(1 / 3), True)
+    assert (score["box_iou_3d"], score["class_accuracy"]) == (pytest.approx(1 / 3), True)
     unknown = ("oriented_box_iou_3d", "chamfer_l2_m", "chamfer_squared_m2", "f_score")
-    assert all(getattr(score, name) is None for name in unknown)
-    assert score_pair(ObjectPair(replace(DESK, mesh=None), None), POINTS).f_score is None
+    assert all(score[name] is None for name in unknown)
+    assert score_pair(ObjectPair(replace(DESK, mesh=None), None), POINTS)["f_score"] is None
     mixed = [[ObjectPair(BED, moved(BED, 0.1)), ObjectPair(replace(DESK, mesh=None), DESK)]]
     one, two = (score_views(v, ["a"], POINTS)["summary"] for v in (mixed, [mixed[0][:1]]))
     assert (one["objects"], one["with_surface"], two["with_surface"]) == (2, 1, 1)

@@ -56,11 +56,6 @@ def class_counts(scenes: Sequence[Scene]) -> Int[np.ndarray, "scenes classes"]:
     return table
 
 
-def class_frequencies(scenes: Sequence[Scene]) -> Float[np.ndarray, "classes"]:
-    """Share of each class among all objects of all scenes, void left out; 0 without objects."""
-    return np.asarray(_shares(class_counts(scenes).sum(0)))
-
-
 def _shares(counts: np.ndarray) -> np.ndarray:
     return np.asarray(counts / np.maximum(counts.sum(-1, keepdims=True), 1))
 
@@ -76,16 +71,8 @@ def category_kl(p: Float[np.ndarray, " classes"], q: Float[np.ndarray, " classes
     return float((p * (np.log(p + KL_EPSILON) - np.log(q + KL_EPSILON))).sum())
 
 
-def type_share(scenes: Sequence[Scene]) -> float | None:
-    """Share of the scenes that hold the furniture of their room type (`TYPE_CLASSES`).
-
-    None for a label set without a room type, and if there are no scenes.
-    """
-    known = [holds for scene in scenes if (holds := _holds_its_type(scene)) is not None]
-    return float(np.mean(known)) if known else None
-
-
 def _holds_its_type(scene: Scene) -> bool | None:
+    """True if a scene holds the furniture of its room type; None without a room type."""
     wanted = TYPE_CLASSES.get(scene.label_set)
     return None if wanted is None else any(item.label in wanted for item in scene.objects)
 

@@ -7,7 +7,6 @@ from functools import partial
 
 import numpy as np
 import shapely
-from jaxtyping import Bool
 
 from sceneprior.core.classes import VOID
 from sceneprior.core.outline import floor_polygon
@@ -120,11 +119,16 @@ metric(
 )(mean_over_rooms(partial(walkable_share, within="floor"), 1.0))  # fmt: skip
 
 
-def out_of_bounds(scene: Scene) -> Bool[np.ndarray, " objects"] | None:
-    """True for objects with less than 99% of their surface over the floor: SceneEval's OOB.
+@metric(
+    "sceneeval_oob_objects", "OOB: objects out of bounds (SceneEval)", "share; known floors only",
+    "lower", USED,
+)  # fmt: skip
+def out_of_bounds(scene: Scene) -> Counts:
+    """Objects with less than 99% of their surface over the floor: SceneEval's OOB.
 
     The surface is represented by `max(1000, 5000 * volume of the box in m3)` points, drawn
-    uniformly by area. A point is in bounds if the floor is below it. None if there is no floor.
+    uniformly by area. A point is in bounds if the floor is below it. Unknown
+    without a floor.
 
     Source:
         3dlg-hcvc/SceneEval, metrics/out_of_bound.py. There the box is the smallest oriented one,
@@ -134,25 +138,15 @@ def out_of_bounds(scene: Scene) -> Bool[np.ndarray, " objects"] | None:
     """
     floor = floor_polygon(scene)
     if floor is None:
-        return None
+        return {}
     floor = floor.buffer(FLUSH_M, join_style="mitre")
     shapely.prepare(floor)
-    found = []
+    outside = 0
     for row, item in enumerate(scene.objects):
         triangles = triangles_of(item)
         count = max(int(np.prod(own_box(item).size_m) * POINTS_PER_M3), FEWEST_POINTS)
         corners = triangles.reshape(-1, 3)
         points = surface_points(corners, np.arange(len(corners)).reshape(-1, 3), count, seed=row)
         within = shapely.contains_xy(floor, points[:, 0], points[:, 2])
-        found.append(within.mean() < INSIDE_SHARE)
-    return np.array(found, dtype=bool)
-
-
-@metric(
-    "sceneeval_oob_objects", "OOB: objects out of bounds (SceneEval)", "share; known floors only",
-    "lower", USED,
-)  # fmt: skip
-def _oob(scene: Scene) -> Counts:
-    found = out_of_bounds(scene)
-    pair = (0.0, 0.0) if found is None else (float(found.sum()), len(found))
-    return {"sceneeval_oob_objects": pair}
+        outside += bool(within.mean() < INSIDE_SHARE)
+    return {"sceneeval_oob_objects": (float(outside), len(scene.objects))}

@@ -92,11 +92,15 @@ def largest_share(areas: Int[np.ndarray, "pixels pixels"]) -> float:
     return float(sizes.max() / sizes.sum()) if len(sizes) else 0.0
 
 
-def navigability(scene: Scene) -> float | None:
+@metric(
+    "sceneeval_navigability", "NAV: navigable in one piece (SceneEval)",
+    "share of free floor; known floors only", "higher", USED,
+)  # fmt: skip
+def navigability(scene: Scene) -> Counts:
     """The largest connected area of free floor, as a share of all free floor: SceneEval's NAV.
 
     The robot is 0.2 m wide, and objects whose centre is above 2 m are no obstacles. 0 if no floor
-    is free; None without a floor outline.
+    is free; unknown without a floor outline.
 
     Source:
         3dlg-hcvc/SceneEval, metrics/navigability.py, with the default settings of its configs.
@@ -104,23 +108,25 @@ def navigability(scene: Scene) -> float | None:
     """
     found = floor_map(scene, SCENEEVAL_ROBOT_M)
     if found is None:
-        return None
-    return largest_share(found.free(scene.centers_m[:, 1] <= SCENEEVAL_HEIGHT_M))
+        return {}
+    free = found.free(scene.centers_m[:, 1] <= SCENEEVAL_HEIGHT_M)
+    return {"sceneeval_navigability": (largest_share(free), 1.0)}
 
 
-@dataclass(frozen=True)
-class Reach:
-    """PhyScene's metrics of the floor of one room."""
-
-    outside: int
-    """Number of objects whose box covers a pixel outside the floor: R_out."""
-    reached: float
-    """R_reach."""
-    walkable: float
-
-
-def reach(scene: Scene) -> Reach | None:
-    """PhyScene's R_out, R_reach and walkable area, for a robot of 0.3 m; None without a floor.
+@metric(
+    "physcene_out", "R_out: objects beyond the floor (PhyScene)", "share; known floors only",
+    "lower", USED,
+)  # fmt: skip
+@metric(
+    "physcene_reach", "R_reach: objects within reach (PhyScene)", "share; known floors only",
+    "higher", USED,
+)  # fmt: skip
+@metric(
+    "physcene_walkable", "Walkable in one piece (PhyScene)",
+    "share of free floor; known floors only", "higher", USED,
+)  # fmt: skip
+def reach(scene: Scene) -> Counts:
+    """PhyScene's R_out, R_reach and walkable area, for a robot of 0.3 m; unknown without a floor.
 
     R_out counts objects whose box covers a pixel outside the floor. R_reach is the expected share
     of objects next to an area of free floor that is chosen with probability proportional to its
@@ -138,71 +144,44 @@ def reach(scene: Scene) -> Reach | None:
     """
     from scipy.ndimage import binary_dilation
 
-    found = floor_map(scene, PHYSCENE_ROBOT_M)
+    found, count = floor_map(scene, PHYSCENE_ROBOT_M), len(scene.objects)
     if found is None:
-        return None
+        return {}
     outside = (found.boxes & ~found.floor).any(axis=(1, 2))
-    everything = np.ones(len(scene.objects), dtype=bool)
-    areas = found.free(everything)
+    areas = found.free(np.ones(count, dtype=bool))
     sizes = np.bincount(areas.ravel())[1:]
     reached = 0.0
     for box in found.grown:
         touched = np.unique(areas[binary_dilation(box, np.ones((3, 3)))])
         reached += sizes[touched[touched > 0] - 1].sum() / max(sizes.sum(), 1)
-    low = scene.centers_m[:, 1] < PHYSCENE_HEIGHT_M
-    walkable = largest_share(found.free(low))
-    return Reach(int(outside.sum()), reached / max(len(everything), 1), walkable)
-
-
-@metric(
-    "sceneeval_navigability", "NAV: navigable in one piece (SceneEval)",
-    "share of free floor; known floors only", "higher", USED,
-)  # fmt: skip
-def _nav(scene: Scene) -> Counts:
-    share = navigability(scene)
-    return {"sceneeval_navigability": (0.0, 0.0) if share is None else (share, 1.0)}
-
-
-@metric(
-    "physcene_out", "R_out: objects beyond the floor (PhyScene)", "share; known floors only",
-    "lower", USED,
-)  # fmt: skip
-@metric(
-    "physcene_reach", "R_reach: objects within reach (PhyScene)", "share; known floors only",
-    "higher", USED,
-)  # fmt: skip
-@metric(
-    "physcene_walkable", "Walkable in one piece (PhyScene)",
-    "share of free floor; known floors only", "higher", USED,
-)  # fmt: skip
-def _reach(scene: Scene) -> Counts:
-    found, count = reach(scene), len(scene.objects)
-    if found is None:
-        return {}
+    walkable = largest_share(found.free(scene.centers_m[:, 1] < PHYSCENE_HEIGHT_M))
     return {
-        "physcene_out": (float(found.outside), float(count)),
-        "physcene_reach": (found.reached, float(count > 0)),
-        "physcene_walkable": (found.walkable, 1.0),
+        "physcene_out": (float(outside.sum()), float(count)),
+        "physcene_reach": (reached / max(count, 1), float(count > 0)),
+        "physcene_walkable": (walkable, 1.0),
     }
 
 
-class Clearance(NamedTuple):
-    """Result for an opening: if an object stands in front of it, and the share of its area
-    covered."""
-
-    blocked: bool
-    covered: float
+_OPENINGS = "doors or windows (openings) in the scenes"
 
 
-def clearances(scene: Scene) -> list[Clearance]:
+@metric(
+    "sceneeval_clear_openings", "Doors and windows with nothing before them (SceneEval)",
+    "share; known openings only", "higher", USED, needs=_OPENINGS,
+)  # fmt: skip
+@metric(
+    "sceneeval_covered_openings", "Area of doors and windows that is covered (SceneEval)",
+    "share; known openings only", "lower", USED, needs=_OPENINGS,
+)  # fmt: skip
+def clear_openings(scene: Scene) -> Counts:
     """Test the space in front of each door and window, inside the room.
 
     The space is as wide and high as the opening. Its depth is the door's width, or 0.5 m for a
     window. An object reaches into the space if one of the random points in its box does (5,000 per
     cubic metre, at least 64). The triangles of such objects that lie at least partly within the
     space's depth are projected onto the opening, on a grid of 100 pixels per metre. The opening is
-    blocked if there are such triangles, and `covered` is the share of its pixels that they cover.
-    An opening with the room on neither side has no entry.
+    blocked if there are such triangles, and covered by the share of its pixels that they cover. An
+    opening with the room on neither side does not count.
 
     Source:
         3dlg-hcvc/SceneEval, metrics/opening_clearance.py, with its default settings: only the side
@@ -211,7 +190,7 @@ def clearances(scene: Scene) -> list[Clearance]:
     """
     floor = floor_polygon(scene)
     if floor is None or not scene.openings:
-        return []
+        return {}
     draws = np.random.default_rng(0)
     points = []
     for item in scene.objects:
@@ -220,7 +199,7 @@ def clearances(scene: Scene) -> list[Clearance]:
         inner = draws.uniform(-0.5, 0.5, (count, 3)) * np.asarray(size_m)
         points.append(inner @ yaw_rotation(yaw_rad).T + np.asarray(item.center_m))
     surfaces = [triangles_of(item) for item in scene.objects]
-    found = []
+    shares = []
     for opening in scene.openings:
         frame = _Frame.of(opening, floor)
         if frame is not None:
@@ -229,8 +208,12 @@ def clearances(scene: Scene) -> list[Clearance]:
                 for surface, inner in zip(surfaces, points, strict=True)
                 if frame.holds(inner)
             ]
-            found.append(frame.clearance(before))
-    return found
+            shares.append(frame.covered_share(before))
+    covered = [share for share in shares if share is not None]
+    return {
+        "sceneeval_clear_openings": (float(len(shares) - len(covered)), len(shares)),
+        "sceneeval_covered_openings": (float(sum(covered)), len(shares)),
+    }
 
 
 class _Frame(NamedTuple):
@@ -261,7 +244,8 @@ class _Frame(NamedTuple):
         inside = (local >= -TOLERANCE_M) & (local <= self.size_m + TOLERANCE_M)
         return bool(inside.all(axis=1).any())
 
-    def clearance(self, surfaces: list[Triangles]) -> Clearance:
+    def covered_share(self, surfaces: list[Triangles]) -> float | None:
+        """Share of the opening's pixels covered; None if no triangle reaches into the space."""
         import cv2
 
         width, height, depth = self.size_m
@@ -275,23 +259,4 @@ class _Frame(NamedTuple):
             for triangle in local[reaching]:
                 pixels = np.stack([triangle[:, 0], height - triangle[:, 1]], axis=1) * PIXELS_PER_M
                 cv2.fillConvexPoly(covered, pixels.astype(np.int32), 1)
-        return Clearance(blocked, float(covered.mean()) if blocked else 0.0)
-
-
-_OPENINGS = "doors or windows (openings) in the scenes"
-
-
-@metric(
-    "sceneeval_clear_openings", "Doors and windows with nothing before them (SceneEval)",
-    "share; known openings only", "higher", USED, needs=_OPENINGS,
-)  # fmt: skip
-@metric(
-    "sceneeval_covered_openings", "Area of doors and windows that is covered (SceneEval)",
-    "share; known openings only", "lower", USED, needs=_OPENINGS,
-)  # fmt: skip
-def _clearance(scene: Scene) -> Counts:
-    found = clearances(scene)
-    return {
-        "sceneeval_clear_openings": (float(sum(not o.blocked for o in found)), len(found)),
-        "sceneeval_covered_openings": (float(sum(o.covered for o in found)), len(found)),
-    }
+        return float(covered.mean()) if blocked else None

@@ -3,7 +3,7 @@ closed, kernel distance (KID in Inception features), precision and recall."""
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -141,12 +141,8 @@ def _gap(boxes: bool, network: str, rooms: RoomSet, comparison: Comparison) -> E
     return Estimate(value, np.array([gap_closed(*three) for three in zip(*moved, strict=True)]))
 
 
-class Kernels(NamedTuple):
-    """Kernel matrices within and between two sets, computed once for all resamples."""
-
-    aa: np.ndarray
-    bb: np.ndarray
-    ab: np.ndarray
+Kernels = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Kernel matrices within two sets and between them, computed once for all resamples."""
 
 
 def kernels(a: Float[np.ndarray, "n dimensions"], b: Float[np.ndarray, "m dimensions"]) -> Kernels:
@@ -157,7 +153,7 @@ def kernels(a: Float[np.ndarray, "n dimensions"], b: Float[np.ndarray, "m dimens
     def kernel(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return (x @ y.T / x.shape[1] + 1) ** 3
 
-    return Kernels(kernel(a, a), kernel(b, b), kernel(a, b))
+    return kernel(a, a), kernel(b, b), kernel(a, b)
 
 
 def kernel_distance(
@@ -173,12 +169,13 @@ def kernel_distance(
 
     `counts_*` hold the multiplicity of each row, one line per resample; None: each row once.
     """
-    counts_a = np.ones((1, len(of.aa)), int) if counts_a is None else counts_a
-    counts_b = np.ones((1, len(of.bb)), int) if counts_b is None else counts_b
+    aa, bb, ab = of
+    counts_a = np.ones((1, len(aa)), int) if counts_a is None else counts_a
+    counts_b = np.ones((1, len(bb)), int) if counts_b is None else counts_b
     n, m = counts_a.sum(1), counts_b.sum(1)
-    within_a = ((counts_a @ of.aa) * counts_a).sum(1) - counts_a @ of.aa.diagonal()
-    within_b = ((counts_b @ of.bb) * counts_b).sum(1) - counts_b @ of.bb.diagonal()
-    between = ((counts_a @ of.ab) * counts_b).sum(1)
+    within_a = ((counts_a @ aa) * counts_a).sum(1) - counts_a @ aa.diagonal()
+    within_b = ((counts_b @ bb) * counts_b).sum(1) - counts_b @ bb.diagonal()
+    between = ((counts_a @ ab) * counts_b).sum(1)
     return np.asarray(within_a / (n * (n - 1)) + within_b / (m * (m - 1)) - 2 * between / (n * m))
 
 

@@ -1,7 +1,5 @@
 """ReSpace's OOB, MBL and PBL: volumes outside the room and shared by objects, in voxels."""
 
-from typing import NamedTuple
-
 import numpy as np
 import shapely
 from jaxtyping import Bool, Int
@@ -26,21 +24,19 @@ LEAST = 1e-7
 """Areas and volumes below this value count as 0."""
 
 
-class VoxelLoss(NamedTuple):
-    """ReSpace's losses of a room, in cubic metres."""
-
-    oob_m3: float
-    mbl_m3: float
-
-    @property
-    def pbl_m3(self) -> float:
-        """PBL: the sum of OOB and MBL."""
-        return self.oob_m3 + self.mbl_m3
+_LITRES = "mean, litres; known floors only"
 
 
-def voxel_loss(scene: Scene) -> VoxelLoss | None:
+@metric("respace_oob_litres", "OOB: volume out of the room (ReSpace)", _LITRES, "lower", USED)
+@metric("respace_mbl_litres", "MBL: volume shared by objects (ReSpace)", _LITRES, "lower", USED)
+@metric("respace_pbl_litres", "PBL: the sum of both (ReSpace)", _LITRES, "lower", USED)
+@metric(
+    "respace_valid", "Rooms with a PBL of at most 100 litres (ReSpace)",
+    "share; known floors only", "higher", USED,
+)  # fmt: skip
+def voxel_loss(scene: Scene) -> Counts:
     """ReSpace's OOB (volume of objects outside the room) and MBL (volume shared by pairs of
-    objects, mesh-based loss). Their sum is PBL (VBL in the paper). None without a floor.
+    objects, mesh-based loss). Their sum is PBL (VBL in the paper). Unknown without a floor.
 
     An object's voxels of 5 cm are those that its surface passes through or encloses. An object is
     voxelized around the centre of its lower face, which is then moved to a whole voxel: rounded
@@ -62,7 +58,7 @@ def voxel_loss(scene: Scene) -> VoxelLoss | None:
     """
     floor = floor_polygon(scene)
     if floor is None:
-        return None
+        return {}
     top_m = ceiling_height(scene)
     wider = floor.buffer(FLUSH_M, join_style="mitre")
     plans = [shapely.Polygon(footprint(item)) for item in scene.objects]
@@ -83,7 +79,13 @@ def voxel_loss(scene: Scene) -> VoxelLoss | None:
             height = min(high, spans[other][1]) - max(low, spans[other][0])
             if height > 0 and _area(plan, plans[other]) * height >= LEAST:
                 shared += _shared(voxels(row), voxels(other))
-    return VoxelLoss(outside * PITCH_M**3, shared * PITCH_M**3)
+    oob_m3, mbl_m3 = outside * PITCH_M**3, shared * PITCH_M**3
+    return {
+        "respace_oob_litres": (1000 * oob_m3, 1.0),
+        "respace_mbl_litres": (1000 * mbl_m3, 1.0),
+        "respace_pbl_litres": (1000 * (oob_m3 + mbl_m3), 1.0),
+        "respace_valid": (float(oob_m3 + mbl_m3 <= VALID_M3), 1.0),
+    }
 
 
 def _area(a: shapely.Geometry, b: shapely.Geometry) -> float:
@@ -131,25 +133,3 @@ def _shared(a: Voxels, b: Voxels) -> int:
         for each in (a, b)
     ]
     return int((parts[0] & parts[1]).sum())
-
-
-_LITRES = "mean, litres; known floors only"
-
-
-@metric("respace_oob_litres", "OOB: volume out of the room (ReSpace)", _LITRES, "lower", USED)
-@metric("respace_mbl_litres", "MBL: volume shared by objects (ReSpace)", _LITRES, "lower", USED)
-@metric("respace_pbl_litres", "PBL: the sum of both (ReSpace)", _LITRES, "lower", USED)
-@metric(
-    "respace_valid", "Rooms with a PBL of at most 100 litres (ReSpace)",
-    "share; known floors only", "higher", USED,
-)  # fmt: skip
-def _respace(scene: Scene) -> Counts:
-    found = voxel_loss(scene)
-    if found is None:
-        return {}
-    return {
-        "respace_oob_litres": (1000 * found.oob_m3, 1.0),
-        "respace_mbl_litres": (1000 * found.mbl_m3, 1.0),
-        "respace_pbl_litres": (1000 * found.pbl_m3, 1.0),
-        "respace_valid": (float(found.pbl_m3 <= VALID_M3), 1.0),
-    }

@@ -8,10 +8,7 @@ import trimesh
 
 from sceneprior.core.scene import Mesh, Opening, Scene, SceneObject, Turned
 from sceneprior.evaluation.metrics.collisions import colliding, containing
-from sceneprior.evaluation.metrics.floor import out_of_bounds
-from sceneprior.evaluation.metrics.navigation import clearances, navigability, reach
 from sceneprior.evaluation.metrics.support import supported
-from sceneprior.evaluation.metrics.voxel_loss import voxel_loss
 from sceneprior.evaluation.use import UseOptions, measure_room, measure_use
 
 FLOOR = np.array([[-2.0, -1.5], [2, -1.5], [2, 1.5], [-2, 1.5]])
@@ -76,20 +73,6 @@ def test_a_corner_in_another_box_is_found_and_a_cross_is_not():
     assert colliding(cross).tolist() == [True, True]
 
 
-# -- Bounds ----------------------------------------------------------------------------------------
-
-
-def test_a_chair_outside_is_out_of_bounds():
-    chair = box(x=3, width=0.5, depth=0.5, label="chair")
-    flush = box(x=1.5, z=1.0)  # at two walls
-    # A cube of 1 m that reaches 3 mm out: 1 / 6 of its surface, the face there, is outside.
-    poking = box(x=1.503)
-    assert out_of_bounds(room(chair, flush, poking)).tolist() == [True, False, True]
-    assert out_of_bounds(room(chair, floor=None)) is None
-    almost = box(x=1.5008)  # floors are given to the millimetre
-    assert out_of_bounds(room(almost)).tolist() == [False] and voxel_loss(room(almost)).oob_m3 == 0
-
-
 # -- Support ---------------------------------------------------------------------------------------
 
 
@@ -124,89 +107,82 @@ def test_shelves_hang_on_walls():
     assert np.isnan(supported(room(shelf(-1.35), floor=None))).all()
 
 
-# -- Floor -----------------------------------------------------------------------------------------
+# -- Values of whole rooms -------------------------------------------------------------------------
 
-
-def test_furniture_across_the_room_parts_the_floor():
-    """A bar from wall to wall: areas of 2.5 x 3 and 1 x 3 m, less the robot's half width."""
-    bar = room(box(x=0.75, width=0.5, depth=3))
-    for share, half in ((navigability(bar), 0.1), (reach(bar).walkable, 0.15)):
-        sides = 2.5 - 2 * half, 1.0 - 2 * half
-        assert share == pytest.approx(sides[0] / sum(sides), abs=0.02)  # of 1.7 cm a pixel
-    assert navigability(room(box(x=0.75, width=0.5, depth=2.5, z=-0.25))) == 1
-    assert navigability(room(box(width=4, depth=3))) == 0
-    assert navigability(room(box(), floor=None)) is None and reach(room(box(), floor=None)) is None
-
-
-def test_an_unreachable_corner():
-    """A corner of 1 x 1 m behind two boxes, with a stool in it."""
-    walls = box(x=1, z=-0.75, width=0.1, depth=1.5), box(x=1.5, z=0, width=1.0, depth=0.1)
-    stool = box(x=1.6, z=-1.1, width=0.3, depth=0.3, label="stool")
-    near = box(x=-1.5, z=1, width=0.5, depth=0.5)
-    found = reach(room(*walls, stool, near))
-    assert found.outside == 0 and 0.8 < found.walkable < 1
-    # Both walls are reached from either side; stool and near box from one side each, so that
+CHAIR = box(x=3, width=0.5, depth=0.5, label="chair")
+BAR = box(x=0.75, width=0.5, depth=3)
+"""From wall to wall: areas of 2.5 x 3 and 1 x 3 m, less the robot's half width."""
+CORNER = (
+    box(x=1, z=-0.75, width=0.1, depth=1.5),
+    box(x=1.5, z=0, width=1.0, depth=0.1),
+    box(x=1.6, z=-1.1, width=0.3, depth=0.3, label="stool"),
+    box(x=-1.5, z=1, width=0.5, depth=0.5),
+)
+"""Two boxes that close a corner of 1 x 1 m with a stool in it, and a box outside it."""
+CRATE = box(z=-1.0, width=0.5, depth=0.5)
+"""In the middle of the door's space."""
+BEYOND, BESIDE = box(z=-0.2, width=0.5, depth=0.5), box(x=1.2, z=-1.0)
+LAYER = 21 * 21 * 0.05**3 * 1000
+"""Litres of a layer of voxels of a cube of 1 m: boxes on the grid fill a voxel more than their
+size."""
+VALUES = [
+    ("sceneeval_oob_objects", room(CHAIR, box(x=1.5, z=1.0)), 1 / 2, 0),
+    ("sceneeval_oob_objects", room(box(x=1.503)), 1, 0),  # a sixth of its surface is outside
+    ("sceneeval_oob_objects", room(box(x=1.5008)), 0, 0),  # floors are given to the millimetre
+    ("sceneeval_oob_objects", room(CHAIR, floor=None), None, 0),
+    # Walls are pixels of 1.7 cm.
+    ("sceneeval_navigability", room(BAR), 2.3 / (2.3 + 0.8), 0.02),
+    ("physcene_walkable", room(BAR), 2.2 / (2.2 + 0.7), 0.02),
+    ("sceneeval_navigability", room(box(x=0.75, width=0.5, depth=2.5, z=-0.25)), 1, 0),
+    ("sceneeval_navigability", room(box(width=4, depth=3)), 0, 0),
+    ("sceneeval_navigability", room(box(), floor=None), None, 0),
+    # The published code takes the first area from above, which is the smaller one here.
+    ("physcene_walkable", room(box(z=-0.75, width=4, depth=0.5)), 1.7 / (1.7 + 0.2), 0.03),
+    ("physcene_out", room(*CORNER), 0, 0),
+    # Both walls are reached from either side; stool and box from one side each, so that
     # 2 + share + (1 - share) of 4 are reached. Slivers of a few pixels are areas, too.
-    assert found.reached == pytest.approx(3 / 4, abs=1e-3)
-    assert reach(room(near)).reached == 1
-
-
-# -- Doors -----------------------------------------------------------------------------------------
-
-
-def test_a_blocked_door():
-    crate = box(z=-1.0, width=0.5, depth=0.5, height=1.0)  # before the middle of the door
-    (door,) = clearances(room(crate, openings=(DOOR,)))
+    ("physcene_reach", room(*CORNER), 3 / 4, 1e-3),
+    ("physcene_out", room(box(x=1.6), box(x=-1.4), box(x=1.5)), 1 / 3, 0),
+    ("physcene_out", room(box(x=1.35, z=0.7, yaw=np.pi / 4)), 1, 0),  # a corner at x = 2.057
+    ("sceneeval_clear_openings", room(CRATE, openings=(DOOR,)), 0, 0),
     # 0.5 of 1 m, and 1 of 2 m.
-    assert door.blocked and door.covered == pytest.approx(0.25, abs=0.01)
-    beyond = box(z=-0.2, width=0.5, depth=0.5)  # 1.05 m from the door
-    beside = box(x=1.2, z=-1.0)
-    assert clearances(room(beyond, beside, openings=(DOOR,))) == [(False, 0.0)]
-    reversed_door = Opening("door", DOOR.end_m, DOOR.start_m, 0.0, 2.0)
-    assert clearances(room(crate, openings=(reversed_door,)))[0].blocked
+    ("sceneeval_covered_openings", room(CRATE, openings=(DOOR,)), 0.25, 0.01),
+    ("sceneeval_clear_openings", room(BEYOND, BESIDE, openings=(DOOR,)), 1, 0),
+    ("sceneeval_clear_openings", room(box(z=1.2, depth=0.5, height=0.8), openings=(WINDOW,)), 1, 0),
+    ("sceneeval_covered_openings", room(box(z=1.2, depth=0.5, height=1.5), openings=(WINDOW,)),
+     0.5, 0.01),
+    ("sceneeval_clear_openings", room(CRATE), None, 0),
+    ("respace_mbl_litres", room(box(), box(x=0.5)), 11 * LAYER, 1e-9),
+    ("respace_oob_litres", room(box(x=2.0)), 10 * LAYER, 1e-9),
+    ("respace_valid", room(box(x=2.0)), 0, 0),
+    ("respace_pbl_litres", room(box(), box(x=1.0), box(x=-1.5, z=1)), 0, 0),  # they touch
+    ("respace_oob_litres", room(box(x=1.5008), box(bottom=-0.002)), 0, 0),
+    ("respace_oob_litres", room(box(bottom=-0.1)), 2 * LAYER, 1e-9),
+    ("respace_oob_litres", room(box(), floor=None), None, 0),
+]  # fmt: skip
 
 
-def test_windows_are_blocked_above_the_sill_only():
-    low, high = box(z=1.2, depth=0.5, height=0.8), box(z=1.2, depth=0.5, height=1.5)
-    assert clearances(room(low, openings=(WINDOW,))) == [(False, 0.0)]
-    (window,) = clearances(room(high, openings=(WINDOW,)))
-    assert window.blocked and window.covered == pytest.approx(0.5, abs=0.01)
-    assert clearances(room(high)) == [] and clearances(room(floor=None)) == []
-
-
-# -- Volumes ---------------------------------------------------------------------------------------
-
-
-def test_shared_and_outer_volumes():
-    # Boxes on the grid fill a voxel more than their size: 21 cells for 1 m.
-    shared = voxel_loss(room(box(), box(x=0.5)))
-    assert shared.mbl_m3 == pytest.approx(11 * 21 * 21 * 0.05**3) and shared.oob_m3 == 0
-    outside = voxel_loss(room(box(x=2.0)))
-    assert outside.oob_m3 == pytest.approx(10 * 21 * 21 * 0.05**3) and outside.mbl_m3 == 0
-    assert outside.pbl_m3 == outside.oob_m3 > 0.1
-    assert voxel_loss(room(box(), box(x=1.0), box(x=-1.5, z=1))).pbl_m3 == 0  # they touch
-    assert voxel_loss(room(box(), floor=None)) is None
-    assert voxel_loss(room(box(bottom=1.8), ceiling_m=2.4)).oob_m3 > 0.1
-    # Sunk by 2 mm it loses nothing, by 10 cm two layers.
-    assert voxel_loss(room(box(bottom=-0.002))).oob_m3 == 0
-    assert voxel_loss(room(box(bottom=-0.1))).oob_m3 == pytest.approx(2 * 21 * 21 * 0.05**3)
-
-
-# -- All of them -----------------------------------------------------------------------------------
+@pytest.mark.parametrize(("key", "scene", "expected", "near"), VALUES)
+def test_values_by_hand(key, scene, expected, near):
+    total, number = measure_room(scene, UseOptions("none")).get(key, (0, 0))
+    found = total / number if number else None
+    assert found == (expected if expected is None else pytest.approx(expected, abs=near, rel=1e-12))
 
 
 def test_rooms_without_floor_or_doors_say_what_is_missing():
     bare = room(box(), floor=None)
-    found = measure_use({"generated": [bare], "test": [room(box())]}, 0, 0, UseOptions("none"))
-    assert found.left_out["sceneeval_oob_objects"] == "a floor (floor_m) in the scenes"
-    assert found.left_out["sceneeval_clear_openings"] == "doors or windows (openings) in the scenes"
-    for column in found.columns.values():
+    sets = {"generated": [bare], "test": [room(box())]}
+    columns, left_out = measure_use(sets, 0, 0, UseOptions("none"))
+    assert left_out["sceneeval_oob_objects"] == "a floor (floor_m) in the scenes"
+    assert left_out["sceneeval_clear_openings"] == "doors or windows (openings) in the scenes"
+    assert left_out["stable_share"] == "--settle solids"
+    for column in columns.values():
         assert set(column) == {
             "sceneeval_col_objects", "sceneeval_col_scenes", "physcene_col_objects",
             "physcene_col_scenes", "sceneeval_supported",
         }  # fmt: skip
-    empty = measure_use({"generated": [room(floor=None)]}, 0, 0, UseOptions("none"))
-    assert empty.left_out["sceneeval_supported"] == "objects in the scenes"
+    _, left_out = measure_use({"generated": [room(floor=None)]}, 0, 0, UseOptions("none"))
+    assert left_out["sceneeval_supported"] == "objects in the scenes"
 
 
 def test_symmetries_change_nothing():
