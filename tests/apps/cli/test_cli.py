@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from cli_helpers import everything_in, one_sentence, refuses
+from cli_helpers import one_sentence, refuses
 from tiny_runs import write_tiny_config
 
 from sceneprior.core import files
@@ -24,28 +24,15 @@ def refuse(number: int):
     return refused
 
 
-def test_bad_shards_are_sentences_and_leave_no_run(command, toy_shards, tmp_path):
-    def fit(shards: Path, *more) -> tuple:
-        config = write_tiny_config(tmp_path / "tiny.yaml", shards)
-        return "fit", "--config", config, "--run", "run", "--accelerator", "cpu", *more
-
-    def refused(key: str, shards: Path, *more) -> None:
-        call = fit(shards, *more)
-        before = everything_in(tmp_path)
-        refuses(command, f"cli/fit_{key}", *call, tmp=tmp_path, shards=toy_shards)
-        assert everything_in(tmp_path) == before  # nothing half-written
-
-    refused("no_shards", tmp_path / "nowhere")
-    refused("two_objects", toy_shards, "--set", "model.max_objects=2")
-    empty = tmp_path / "empty"
-    (empty / "train").mkdir(parents=True)
-    refused("unfinished_shards", empty)
+@pytest.mark.parametrize("kept", [0, 3000])
+def test_damaged_shards_are_a_sentence_and_leave_no_run(command, toy_shards, tmp_path, kept):
     corrupt = shutil.copytree(toy_shards, tmp_path / "corrupt")
     victim = list_shards(corrupt, "train")[1]
-    for content in (victim.read_bytes()[:3000], b""):
-        victim.write_bytes(content)
-        said = one_sentence(command(*fit(corrupt)))
-        assert str(victim) in said and "the file is damaged. Delete it and run the same" in said
+    victim.write_bytes(victim.read_bytes()[:kept])
+    config = write_tiny_config(tmp_path / "tiny.yaml", corrupt)
+    said = one_sentence(command("fit", "--config", config, "--run", "run", "--accelerator", "cpu"))
+    assert str(victim) in said and "the file is damaged. Delete it and run the same" in said
+    assert not (tmp_path / "run").exists()
 
 
 def test_options_that_lightning_refuses_are_a_sentence(command, toy_shards, tmp_path):
@@ -90,14 +77,6 @@ def test_what_a_command_could_not_write_is_named(command, toy_run, monkeypatch, 
     assert not list(Path().iterdir())
 
 
-@pytest.mark.parametrize("words", [("synthesize", "-n", 1, "--out"), ("make-homes",)])
-def test_a_folder_that_cannot_be_made_is_a_sentence(command, toy_run, words):
-    name, *more = words
-    run = [] if name == "make-homes" else ["--run", toy_run]
-    said = one_sentence(command(name, *run, *more, "/proc/none"))
-    assert "/proc/none" in said and "cannot be read or written (No such file or directory)" in said
-
-
 def test_a_folder_that_is_not_empty_is_noticed_before_torch_is_imported(tmp_path):
     (tmp_path / "file").touch()
     words = ["sceneprior", "synthesize", "--run", "demo-bedroom", "--out", str(tmp_path)]
@@ -140,3 +119,12 @@ def test_commands_on_a_disk_that_is_full(command, toy_run, toy_shards, tmp_path)
         assert f"{disk / 'full'}" in on_full(*fit, disk / "full")
     finally:
         subprocess.run(["umount", str(disk)], check=True)
+
+
+def test_a_page_needs_its_extra_and_a_host(command, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "viser", None)  # what an import finds where there is none
+        refuses(command, "cli/view_without_viser", "view", "run")
+    pytest.importorskip("viser", reason="the extra `view` is not installed")
+    said = one_sentence(command("view", "run", "--host", "no.such.host.invalid"))
+    assert "of no.such.host.invalid cannot be used" in said

@@ -77,21 +77,6 @@ def test_reconstruct_an_own_image(command, toy_run, own, tmp_path):
     assert re.search(r"Note: a camera 1(\.[2468])? m above the floor fits best\.", errors)
 
 
-@pytest.mark.parametrize(
-    ("key", "words"),
-    [
-        ("no_room", ["--room", "attic"]),
-        ("no_view", ["--room", "toy/test_00", "--view", 8]),
-        ("no_fit", ["--split", "test", "--fit", "slow"]),
-        ("no_split", ["--split", "val"]),
-    ],
-)
-def test_what_cannot_be_reconstructed(command, toy_run, toy_shards, tmp_path, key, words):
-    call = ["reconstruct", "--run", toy_run, "--out", "none", "--shards", toy_shards]
-    refuses(command, f"cli/reconstruct_{key}", *call, *words, shards=toy_shards)
-    assert not (tmp_path / "none").exists()
-
-
 def test_eval_svr_of_a_run_and_of_its_scenes(command, toy_run, toy_shards, tmp_path):
     call = ["eval-svr", "--shards", toy_shards]
     two = ["--run", toy_run, "--limit", 2, *PAPER]
@@ -129,4 +114,3 @@ def test_scenes_that_answer_no_image(command, toy_run, toy_shards, tmp_path):
     }.items():
         path.write_text(json.dumps({**whole, **changes}))
         refuses(command, f"cli/eval_svr_scenes_{key}", *call, shards=toy_shards)
-    refuses(command, "cli/eval_svr_no_scenes", *call[:-1], "nowhere")
