@@ -4,17 +4,8 @@ from pathlib import Path
 from typing import Any
 
 from refusals import refused
-from typer.testing import CliRunner
 
-from sceneprior.apps.cli.commands import app
 from sceneprior.core.errors import InputError
-
-
-def call_here(arguments: list[str], log: Path) -> tuple[int, dict[str, float], bool]:
-    """Stands in for `commands.call`, which test_commands.py tests: the command in this process."""
-    done = CliRunner().invoke(app, arguments)
-    log.write_text(done.output)
-    return done.exit_code, {"cpu_s": 2.5, "wall_s": 3.0, "peak_memory_gib": 0.5}, False
 
 
 def one_sentence(result: tuple[int, str, str]) -> str:

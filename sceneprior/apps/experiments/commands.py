@@ -1,4 +1,4 @@
-"""Runs `sceneprior` commands that can be stopped and continued, each in a process of its own.
+"""Runs `sceneprior` commands one after the other, so that they can be stopped and continued.
 
 The `steps.json` of a folder records each command, its costs and whether it finished, so that a
 reader who doubts a number can run the command again.
@@ -6,21 +6,26 @@ reader who doubts a number can run the command again.
 
 import contextlib
 import os
+import resource
 import shlex
 import signal
-import subprocess
 import sys
 import time
-from collections.abc import Sequence
+import traceback
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
-from sceneprior.core.errors import InputError
-from sceneprior.core.files import read_json, write_json
+import torch
 
-_STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import only_writer, read_json, write_json
+
+
+STOPPED = 130
+"""Exit status of a command after Ctrl-C."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +50,19 @@ def is_done(command: Command, folder: Path) -> bool:
     return same and bool(noted.get("finished")) and command.result.exists()
 
 
+@contextlib.contextmanager
+def running_commands(out: Path) -> Iterator[None]:
+    """Lock a folder against other runners; SIGTERM and SIGHUP end a command as Ctrl-C does, so that
+    it saves its work."""
+    with only_writer(out), contextlib.ExitStack() as until_done:
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            handler = signal.getsignal(number)
+            if handler is not signal.SIG_IGN:
+                until_done.callback(signal.signal, number, handler)
+                signal.signal(number, signal.default_int_handler)
+        yield
+
+
 def run_command(
     command: Command, folder: Path, log: Path | None = None, unshown: Sequence[str] = ()
 ) -> None:
@@ -55,8 +73,8 @@ def run_command(
         unshown: Further arguments, which are neither printed nor recorded.
 
     Raises:
-        InputError: the command failed; the message is the command's own, if `log` holds one.
-        KeyboardInterrupt: a signal stopped it; its costs so far are recorded.
+        InputError: the command failed.
+        KeyboardInterrupt: it was stopped; its costs so far are recorded.
     """
     print(f"$ sceneprior {shlex.join(command.arguments)}", file=sys.stderr, flush=True)
     noted = read_journal(folder)
@@ -66,64 +84,53 @@ def run_command(
     entry: dict[str, Any] = {"arguments": command.arguments, "depends_on": command.depends_on}
     # Recorded without costs until it ends: the costs of a killed command are unknown.
     write_json(folder / "steps.json", {**earlier, command.name: entry})
-    status, costs, stopped = call([*command.arguments, *unshown], log)
-    for name in ("cpu_s", "wall_s"):
-        entry[name] = None if took.get(name) is None else took[name] + costs[name]
-    entry["peak_memory_gib"] = max(took.get("peak_memory_gib") or 0.0, costs["peak_memory_gib"])
-    entry["finished"] = status == 0
-    write_json(folder / "steps.json", {**earlier, command.name: entry})
-    if stopped:
+    start, finished = costs(), False
+    try:
+        call([*command.arguments, *unshown], log)
+        finished = True
+    finally:
+        end = costs()
+        for name in ("cpu_s", "wall_s"):
+            known = took.get(name) is not None
+            entry[name] = took[name] + end[name] - start[name] if known else None
+        entry["peak_memory_gib"] = max(took.get("peak_memory_gib") or 0.0, end["peak_memory_gib"])
+        entry["finished"] = finished
+        write_json(folder / "steps.json", {**earlier, command.name: entry})
+
+
+def call(arguments: Sequence[str], log: Path | None) -> None:
+    """Run a command in this process; an InputError says why it failed."""
+    from sceneprior.apps.cli.commands import app
+
+    threads = torch.get_num_threads()
+    with contextlib.ExitStack() as until_done:
+        until_done.callback(torch.set_num_threads, threads)  # `fit` may have changed it
+        if log is not None:
+            output = until_done.enter_context(log.open("w"))
+            until_done.enter_context(contextlib.redirect_stdout(output))
+            until_done.enter_context(contextlib.redirect_stderr(output))
+        try:
+            status = app(list(arguments), standalone_mode=False)
+        except InputError:
+            raise
+        except Exception as error:
+            traceback.print_exc()
+            raise InputError(f"{type(error).__name__}: {error}") from None
+    if status == STOPPED:  # `fit` saves its work first
         raise KeyboardInterrupt
     if status:
-        raise InputError(failure_reason(log, status))
+        raise InputError(f"exit status {status}")
 
 
-def call(arguments: Sequence[str], log: Path | None) -> tuple[int, dict[str, float], bool]:
-    """Run a command to its end; returns its exit status, its costs, and whether it was stopped.
-
-    Ctrl-C, SIGTERM and SIGHUP reach the command as SIGINT, so that it saves its work.
-    """
-    running: list[int] = []
-    stopped: list[int] = []
-
-    def stop(number: int, frame: Any) -> None:
-        stopped.append(number)
-        for process_group in running:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(process_group, signal.SIGINT)
-
-    def ignore(number: int, frame: Any) -> None:
-        """In place of SIG_IGN, which the command would inherit: `stop` has to reach it."""
-
-    start = time.monotonic()
-    before = {number: signal.getsignal(number) for number in _STOPPING}
-    with contextlib.nullcontext() if log is None else log.open("wb") as output:
-        try:
-            for number, handler in before.items():
-                if handler is not signal.SIG_IGN:
-                    signal.signal(number, stop)
-                elif number == signal.SIGINT:
-                    signal.signal(number, ignore)
-            process = subprocess.Popen(
-                [sys.executable, "-m", "sceneprior", *arguments],
-                stdin=subprocess.DEVNULL, stdout=output, stderr=output,
-                process_group=0,  # so that only `stop` passes Ctrl-C on, and only once
-            )  # fmt: skip
-            running.append(process.pid)
-            if stopped:  # a signal came while the process started
-                stop(stopped[0], None)
-            # wait4 returns the usage of this child and its descendants only.
-            _, status, used = os.wait4(process.pid, 0)
-            process.returncode = os.waitstatus_to_exitcode(status)
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
-    costs = {
-        "cpu_s": used.ru_utime + used.ru_stime,
-        "wall_s": time.monotonic() - start,
-        "peak_memory_gib": used.ru_maxrss / 2**20,  # KiB; its largest process, or this one
+def costs() -> dict[str, float]:
+    """CPU and wall-clock seconds so far, and the memory of the largest process so far."""
+    used = os.times()
+    peaks = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    return {
+        "cpu_s": used.user + used.system + used.children_user + used.children_system,
+        "wall_s": time.monotonic(),
+        "peak_memory_gib": max(resource.getrusage(who).ru_maxrss for who in peaks) / 2**20,
     }
-    return process.returncode, costs, bool(stopped)
 
 
 def read_journal(folder: Path) -> dict[str, Any]:
@@ -140,15 +147,3 @@ def read_result(path: Path) -> dict[str, Any]:
         raise InputError(
             f"{path} is damaged; delete it and run the same command again: training is kept."
         ) from None
-
-
-def failure_reason(log: Path | None, status: int) -> str:
-    """The error message of a failed command, or else the last line of its output."""
-    if log is None:
-        return f"exit status {status}"
-    lines = [line.strip() for line in log.read_text(errors="replace").splitlines()]
-    errors = [line.removeprefix("Error: ") for line in lines if line.startswith("Error: ")]
-    told = errors or [line for line in lines if line]
-    if status < 0 and not errors:
-        return f"killed by {signal.Signals(-status).name}; run the same command again to continue"
-    return told[-1] if told else f"it printed nothing to {log}"

@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sceneprior.apps.config import load_config
-from sceneprior.apps.experiments.commands import Command, is_done, run_command
+from sceneprior.apps.experiments.commands import Command, is_done, run_command, running_commands
 from sceneprior.apps.experiments.comparison import Comparison, RoomComparison, ViewComparison
 from sceneprior.apps.experiments.runs import Run, runs_of, shards_of, variants_of
 from sceneprior.apps.experiments.table import write_tables
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import only_writer
 from sceneprior.core.ground_truth import known_in_3d
 from sceneprior.core.shards import iterate_rooms
 from sceneprior.evaluation.features import check_inception
@@ -59,7 +58,7 @@ def compare(
     for run in part:
         count(run.rooms)  # unusable shards raise here, before anything is trained
     done, failures, left_out = list[Run](), list[str](), list[str]()
-    with only_writer(out):
+    with running_commands(out):
         for run in runs_of(comparison, out):
             evaluated = (run.folder / "scores.json").is_file()
             if run not in part and not evaluated:

@@ -14,9 +14,10 @@ from sceneprior.apps.experiments.commands import (
     read_journal,
     read_result,
     run_command,
+    running_commands,
 )
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import only_writer, write_json
+from sceneprior.core.files import write_json
 
 
 def run_demo(out: Path, config: str, rooms: int, count: int) -> None:
@@ -25,7 +26,7 @@ def run_demo(out: Path, config: str, rooms: int, count: int) -> None:
     Ctrl-C, SIGTERM and SIGHUP raise KeyboardInterrupt; a second, identical call continues.
     """
     commands = demo_commands(out, config, rooms, count)
-    with only_writer(out):
+    with running_commands(out):
         for command in commands:
             if is_done(command, out):
                 took = read_journal(out)[command.name]["wall_s"]
@@ -39,7 +40,8 @@ def run_demo(out: Path, config: str, rooms: int, count: int) -> None:
                     told += ["--command", f"sceneprior {shlex.join(earlier.arguments)}"]
             try:
                 run_command(command, out, unshown=told)
-            except InputError:
+            except InputError as error:
+                print(f"Error: {error}", file=sys.stderr)
                 raise InputError(
                     f"The demo stopped at '{command.name}'; fix the error and run it again."
                 ) from None

@@ -10,7 +10,6 @@ import h5py
 import pytest
 import torch
 import yaml
-from cli_helpers import call_here
 from made_results import METHODS, write_comparison, write_new_rooms
 from refusals import refused
 from tiny_runs import tiny_baseline_settings
@@ -20,7 +19,7 @@ from sceneprior.apps.experiments import commands, table
 from sceneprior.apps.experiments.compare import Compared, commands_of, compare
 from sceneprior.apps.experiments.runs import load_comparison, part_of, runs_of, shards_of
 from sceneprior.apps.experiments.table import costs_of, rows_of
-from sceneprior.core.errors import ConfigError
+from sceneprior.core.errors import ConfigError, InputError
 from sceneprior.core.files import write_json
 from sceneprior.paper.fit_image import SCHEDULES, FitSchedule
 
@@ -158,13 +157,12 @@ class Calls:
     """Stands in for the commands; says how each ends."""
 
     def __init__(self):
-        self.arguments, self.status, self.stopped = [], 0, False
+        self.arguments, self.error = [], None
 
     def __call__(self, arguments, log):
         self.arguments.append(arguments)
-        log.write_text("working\nError: no room for more.\n")
-        costs = {"cpu_s": 2.5, "wall_s": 3.0, "peak_memory_gib": 0.5}
-        return self.status, costs, self.stopped
+        if self.error is not None:
+            raise self.error
 
     @property
     def names(self):
@@ -199,7 +197,7 @@ def test_finished_commands_are_not_repeated_and_stay_in_the_table(begun, tmp_pat
     table = done.table.read_text()
     assert "| Paper's method | paper |" in table and "LSTM" not in table
     # A second method joins, and fails.
-    calls.status = 2
+    calls.error = InputError("no room for more.")
     done = again(begun, tmp_path, None)
     assert calls.names == ["fit"] and done.failures == ["toy, lstm, seed 3: no room for more."]
     assert done.table.read_text() == table
@@ -244,7 +242,7 @@ def test_a_damaged_file_is_named(begun, tmp_path, calls):
 
 
 def test_a_stopped_comparison_says_how_to_continue(command, written, calls, tmp_path):
-    calls.stopped = True
+    calls.error = KeyboardInterrupt()
     status, _, errors = command("compare", "--config", written(), "--out", tmp_path / "out")
     assert status == 130 and errors.endswith("Stopped. Run the same command again to continue.\n")
     assert calls.names == ["fit"] and not (tmp_path / "out" / "table.md").exists()
@@ -253,7 +251,6 @@ def test_a_stopped_comparison_says_how_to_continue(command, written, calls, tmp_
 def test_existing_scenes_are_a_row_and_evaluated_again_when_they_change(
     begun, toy_shards, scenes, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(commands, "call", call_here)
     scenes = shutil.copytree(scenes, tmp_path / "given", ignore=shutil.ignore_patterns("scores*"))
     methods = {"paper": {}, "theirs": {"title": "Theirs", "scenes": {"toy": str(scenes)}}}
     done = again(begun, tmp_path, "theirs", methods=methods)
@@ -283,8 +280,7 @@ def test_a_fit_of_single_views_is_scored_and_tabulated(toy_run, toy_shards, tmp_
     run = runs_of(comparison, tmp_path / "out")[0]
     shutil.copytree(toy_run, run.folder / "run")
     monkeypatch.setattr(table, "costs_of", lambda run: {"parameters": 7})
-    status, _, _ = call_here(commands_of(comparison, run, 1)[-1].arguments, tmp_path / "log")
-    assert status == 0, (tmp_path / "log").read_text()
+    commands.call(commands_of(comparison, run, 1)[-1].arguments, tmp_path / "log")
     (row,) = rows_of(comparison, run)
     assert row.title == "Paper: fit of a latent" and row.scores["parameters"]
     assert row.scores["images"] == 2 and row.scores["seconds"] > 0

@@ -29,10 +29,13 @@ def ran(tmp_path, monkeypatch):
             path = results[arguments[0]]
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(json.dumps({"protocol": {}}))
-        costs = {"cpu_s": 3.0, "wall_s": 2.0, "peak_memory_gib": 0.5}
-        return status.get(arguments[0], 0), costs, False
+        clock["wall_s"] += 2.0
+        if status.get(arguments[0]):
+            raise InputError("no.")
 
+    clock = {"cpu_s": 3.0, "wall_s": 0.0, "peak_memory_gib": 0.5}
     monkeypatch.setattr(commands, "call", call)
+    monkeypatch.setattr(commands, "costs", clock.copy)
     return called, status
 
 
