@@ -23,7 +23,6 @@ import torch
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import only_writer, read_json, write_json
 
-
 STOPPED = 130
 """Exit status of a command after Ctrl-C."""
 
