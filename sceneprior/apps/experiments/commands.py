@@ -12,7 +12,7 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
@@ -23,6 +23,8 @@ import torch
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import only_writer, read_json, write_json
 
+Main = Callable[[list[str]], int | None]
+"""The command line: runs a command in this process; returns its exit status."""
 STOPPED = 130
 """Exit status of a command after Ctrl-C."""
 
@@ -63,7 +65,11 @@ def running_commands(out: Path) -> Iterator[None]:
 
 
 def run_command(
-    command: Command, folder: Path, log: Path | None = None, unshown: Sequence[str] = ()
+    main: Main,
+    command: Command,
+    folder: Path,
+    log: Path | None = None,
+    unshown: Sequence[str] = (),
 ) -> None:
     """Run a command, record it in `folder`, and drop the records of later ones, now out of date.
 
@@ -85,7 +91,7 @@ def run_command(
     write_json(folder / "steps.json", {**earlier, command.name: entry})
     start, finished = costs(), False
     try:
-        call([*command.arguments, *unshown], log)
+        call(main, [*command.arguments, *unshown], log)
         finished = True
     finally:
         end = costs()
@@ -97,10 +103,8 @@ def run_command(
         write_json(folder / "steps.json", {**earlier, command.name: entry})
 
 
-def call(arguments: Sequence[str], log: Path | None) -> None:
-    """Run a command in this process; an InputError says why it failed."""
-    from sceneprior.apps.cli.commands import app
-
+def call(main: Main, arguments: list[str], log: Path | None) -> None:
+    """Run a command; an InputError says why it failed."""
     threads = torch.get_num_threads()
     with contextlib.ExitStack() as until_done:
         until_done.callback(torch.set_num_threads, threads)  # `fit` may have changed it
@@ -109,7 +113,7 @@ def call(arguments: Sequence[str], log: Path | None) -> None:
             until_done.enter_context(contextlib.redirect_stdout(output))
             until_done.enter_context(contextlib.redirect_stderr(output))
         try:
-            status = app(list(arguments), standalone_mode=False)
+            status = main(arguments)
         except InputError:
             raise
         except Exception as error:

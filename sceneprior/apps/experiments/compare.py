@@ -11,7 +11,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sceneprior.apps.config import load_config
-from sceneprior.apps.experiments.commands import Command, is_done, run_command, running_commands
+from sceneprior.apps.experiments.commands import (
+    Command,
+    Main,
+    is_done,
+    run_command,
+    running_commands,
+)
 from sceneprior.apps.experiments.comparison import Comparison, RoomComparison, ViewComparison
 from sceneprior.apps.experiments.runs import Run, runs_of, shards_of, variants_of
 from sceneprior.apps.experiments.table import write_tables
@@ -40,6 +46,7 @@ def compare(
     comparison: Comparison,
     part: Sequence[Run],
     out: Path,
+    main: Main,
     inception: Path | None = None,
     accelerator: str = "auto",
 ) -> Compared:
@@ -64,7 +71,7 @@ def compare(
             if run not in part and not evaluated:
                 continue
             commands = commands_of(comparison, run, count(run.rooms), inception, accelerator)
-            if run in part and (failure := _finish(run, commands)):
+            if run in part and (failure := _finish(run, commands, main)):
                 failures.append(f"{run.title}: {failure}")
             elif keeps_settings(run) and all(is_done(each, run.folder) for each in commands):
                 done.append(run)
@@ -75,7 +82,7 @@ def compare(
     return Compared(out / "table.md" if done else None, failures, left_out)
 
 
-def _finish(run: Run, commands: list[Command]) -> str | None:
+def _finish(run: Run, commands: list[Command], main: Main) -> str | None:
     """Run the unfinished commands of a run; returns a sentence if one fails, else None."""
     if not keeps_settings(run):
         return (
@@ -85,7 +92,7 @@ def _finish(run: Run, commands: list[Command]) -> str | None:
     try:
         for command in commands:
             if not is_done(command, run.folder):
-                run_command(command, run.folder, run.folder / f"{command.name}.log")
+                run_command(main, command, run.folder, run.folder / f"{command.name}.log")
     except InputError as error:
         return str(error)
     return None

@@ -10,6 +10,7 @@ from pathlib import Path
 from sceneprior.apps.config import load_config
 from sceneprior.apps.experiments.commands import (
     Command,
+    Main,
     is_done,
     read_journal,
     read_result,
@@ -20,7 +21,7 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.files import write_json
 
 
-def run_demo(out: Path, config: str, rooms: int, count: int) -> None:
+def run_demo(out: Path, config: str, rooms: int, count: int, main: Main) -> None:
     """Run every unfinished command, then add time and memory to the scores.
 
     Ctrl-C, SIGTERM and SIGHUP raise KeyboardInterrupt; a second, identical call continues.
@@ -39,7 +40,7 @@ def run_demo(out: Path, config: str, rooms: int, count: int) -> None:
                 for earlier in commands[:-1]:
                     told += ["--command", f"sceneprior {shlex.join(earlier.arguments)}"]
             try:
-                run_command(command, out, unshown=told)
+                run_command(main, command, out, unshown=told)
             except InputError as error:
                 print(f"Error: {error}", file=sys.stderr)
                 raise InputError(

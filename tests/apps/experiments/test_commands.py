@@ -2,14 +2,18 @@
 
 import json
 import signal
+from functools import partial
 
 import pytest
 import torch
 
+from sceneprior.apps.cli.commands import app
 from sceneprior.apps.experiments import commands
 from sceneprior.apps.experiments.commands import Command, is_done, run_command, running_commands
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import only_writer
+
+MAIN = partial(app, standalone_mode=False)
 
 
 @pytest.fixture
@@ -19,7 +23,7 @@ def version(tmp_path) -> Command:
 
 
 def test_a_command_is_printed_logged_recorded_and_done(version, tmp_path, capsys):
-    run_command(version, tmp_path, version.result)
+    run_command(MAIN, version, tmp_path, version.result)
     assert capsys.readouterr().err == "$ sceneprior --version\n"
     assert version.result.read_text().startswith("sceneprior 0.")
     noted = json.loads((tmp_path / "steps.json").read_text())["say"]
@@ -35,7 +39,7 @@ def test_a_failed_command_is_its_own_sentence_and_drops_what_came_after(version,
     (tmp_path / "steps.json").write_text('{"first": {}, "fail": {}, "say": {"finished": true}}')
     command = Command("fail", ["inspect", "nowhere"], tmp_path / "no", depends_on=[])
     with pytest.raises(InputError, match="nowhere"):
-        run_command(command, tmp_path, tmp_path / "fail.log")
+        run_command(MAIN, command, tmp_path, tmp_path / "fail.log")
     noted = json.loads((tmp_path / "steps.json").read_text())
     assert list(noted) == ["first", "fail"] and not noted["fail"]["finished"]
 
@@ -48,21 +52,21 @@ def test_a_bug_is_a_sentence_with_its_traceback_in_the_log(tmp_path, monkeypatch
     monkeypatch.setattr("sceneprior.apps.config.load_config", broken)
     command = Command("fit", ["fit", "--config", "demo.yaml", "--run", "r"], tmp_path / "no", [])
     with pytest.raises(InputError, match=r"^KeyError: 'lamp'$"):
-        run_command(command, tmp_path, tmp_path / "fit.log")
+        run_command(MAIN, command, tmp_path, tmp_path / "fit.log")
     assert "Traceback" in (tmp_path / "fit.log").read_text() and torch.get_num_threads() == 1
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_signals_stop_a_command_and_its_costs_are_recorded(tmp_path, monkeypatch, name):
     number = signal.Signals[name]
-    monkeypatch.setattr(commands, "call", lambda arguments, log: signal.raise_signal(number))
+    monkeypatch.setattr(commands, "call", lambda *given: signal.raise_signal(number))
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     handler = signal.getsignal(number)
     try:
         with pytest.raises(KeyboardInterrupt), running_commands(tmp_path):
             with pytest.raises(InputError, match="Another run is writing"), only_writer(tmp_path):
                 pass
-            run_command(Command("wait", [], tmp_path / "no", []), tmp_path)
+            run_command(MAIN, Command("wait", [], tmp_path / "no", []), tmp_path)
         assert signal.getsignal(number) is handler
     finally:
         signal.signal(signal.SIGINT, before)

@@ -14,6 +14,7 @@ from made_results import METHODS, write_comparison, write_new_rooms
 from refusals import refused
 from tiny_runs import tiny_baseline_settings
 
+from sceneprior.apps.cli.commands import app
 from sceneprior.apps.config import load_any_run
 from sceneprior.apps.experiments import commands, table
 from sceneprior.apps.experiments.compare import Compared, commands_of, compare
@@ -22,6 +23,8 @@ from sceneprior.apps.experiments.table import costs_of, rows_of
 from sceneprior.core.errors import ConfigError, InputError
 from sceneprior.core.files import write_json
 from sceneprior.paper.fit_image import SCHEDULES, FitSchedule
+
+MAIN = partial(app, standalone_mode=False)
 
 
 @pytest.fixture
@@ -68,7 +71,7 @@ def test_rooms_without_a_truth_are_refused_before_anything_is_trained(toy_shards
                 del room["ground_truth"]
     comparison = load_comparison(write_comparison(tmp_path, blind, task="single_views"))
     with refused("apps/compare_blind", tmp=tmp_path):
-        compare(comparison, runs_of(comparison, tmp_path / "out"), tmp_path / "out")
+        compare(comparison, runs_of(comparison, tmp_path / "out"), tmp_path / "out", MAIN)
     assert not (tmp_path / "out" / "toy").exists()
 
 
@@ -159,7 +162,7 @@ class Calls:
     def __init__(self):
         self.arguments, self.error = [], None
 
-    def __call__(self, arguments, log):
+    def __call__(self, main, arguments, log):
         self.arguments.append(arguments)
         if self.error is not None:
             raise self.error
@@ -178,7 +181,7 @@ def calls(monkeypatch) -> Calls:
 
 def again(begun, tmp_path, part: str | None = "paper", **changes) -> Compared:
     comparison = load_comparison(begun(**changes))
-    return compare(comparison, part_of(comparison, tmp_path / "out", part), tmp_path / "out")
+    return compare(comparison, part_of(comparison, tmp_path / "out", part), tmp_path / "out", MAIN)
 
 
 def test_costs_are_those_of_training(begun, tmp_path, toy_run):
@@ -280,7 +283,7 @@ def test_a_fit_of_single_views_is_scored_and_tabulated(toy_run, toy_shards, tmp_
     run = runs_of(comparison, tmp_path / "out")[0]
     shutil.copytree(toy_run, run.folder / "run")
     monkeypatch.setattr(table, "costs_of", lambda run: {"parameters": 7})
-    commands.call(commands_of(comparison, run, 1)[-1].arguments, tmp_path / "log")
+    commands.call(MAIN, commands_of(comparison, run, 1)[-1].arguments, tmp_path / "log")
     (row,) = rows_of(comparison, run)
     assert row.title == "Paper: fit of a latent" and row.scores["parameters"]
     assert row.scores["images"] == 2 and row.scores["seconds"] > 0

@@ -22,7 +22,7 @@ def ran(tmp_path, monkeypatch):
     status: dict[str, int] = {}
     results = {step.arguments[0]: step.result for step in demo_commands(tmp_path, *SETTINGS)}
 
-    def call(arguments, log):
+    def call(main, arguments, log):
         assert log is None  # progress goes to the terminal
         called.append(arguments)
         if not status.get(arguments[0]):
@@ -41,7 +41,7 @@ def ran(tmp_path, monkeypatch):
 
 def run(out: Path, called: list[list[str]], **changes) -> list[str]:
     called.clear()
-    run_demo(out, *(SETTINGS if not changes else changes["settings"]))
+    run_demo(out, *(SETTINGS if not changes else changes["settings"]), main=int)
     return [arguments[0] for arguments in called]
 
 
