@@ -21,7 +21,7 @@ from sceneprior.paper.fit_image import FitSchedule, fit_latents_to_images
 from sceneprior.paper.interpolate import interpolate
 from sceneprior.paper.losses import mask_loss
 from sceneprior.paper.prior import TrainedPrior
-from sceneprior.paper.view_loss import match_and_score, seen_boxes, seen_masks
+from sceneprior.paper.view_loss import match_and_score, proxy_boxes, seen_boxes, seen_masks
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "learning.json"
 
@@ -119,10 +119,13 @@ def test_losses_of_views(paper, images):
     scenes = paper.prior.decode(paper.prior.latent_space(paper.logits[:4]), views.is_object)
     weights, drawing = paper.config.view_terms
     boxes = seen_boxes(scenes, views, drawing)
+    proxies = {
+        name: proxy_boxes(scenes, views, name).boxes for name in ("ellipsoid", "beveled_box")
+    }
     losses, matches = match_and_score(scenes, boxes, views, weights, "first_n")
     masks = seen_masks(scenes.vertices_m, paper.prior.faces, views, drawing)
     losses["mask"], overlap = mask_loss(masks, views, matches, 0.0)
-    check("view_losses", predictions=matches.prediction, **losses, **overlap)
+    check("view_losses", predictions=matches.prediction, **proxies, **losses, **overlap)
 
 
 def test_losses_against_lifted_boxes(lifted, rooms):

@@ -1,14 +1,26 @@
-"""Lifted boxes as targets: the matching against all permutations, the terms against loops."""
+"""Lifted boxes as targets: the matching against all permutations, the terms against loops; and the
+distance of training latents to drawn ones."""
 
+import warnings
 from itertools import permutations
 
 import pytest
 import torch
+from scipy.optimize import linear_sum_assignment
+from tiny_runs import tiny_lifted
 from torch.nn import functional as F
 from torch.testing import assert_close
 
+from sceneprior.core.errors import InputWarning
 from sceneprior.core.views import DecodedScenes
-from sceneprior.lifted.losses import PER_METRE, lifted_losses, match_lifted, shape_code_loss
+from sceneprior.lifted.losses import (
+    PER_METRE,
+    latent_loss,
+    lifted_losses,
+    match_lifted,
+    shape_code_loss,
+    sliced_wasserstein,
+)
 from sceneprior.lifted.rooms import LiftedRooms, PosedScenes
 
 COUNTS = (3, 2, 0)
@@ -106,3 +118,48 @@ def test_the_distance_of_codes_is_a_filled_cell_s(scenes, rooms, torch_rng):
 
     assert_close(loss(codes), torch.stack(apart).mean(), rtol=0, atol=1e-12)
     assert torch.autograd.gradcheck(loss, codes)
+
+
+def points(rows, columns, seed):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(rows, columns, generator=generator, dtype=torch.float64)
+
+
+def test_the_distance_on_each_line_is_that_of_the_cheapest_assignment():
+    some, others = points(9, 4, 0) * 2, points(9, 4, 1) + 1
+    directions = F.normalize(points(4, 5, 2), dim=0)
+    cheapest = []
+    for line in directions.T:
+        cost = (some @ line)[:, None].sub((others @ line)[None]).square().numpy()
+        cheapest.append(cost[linear_sum_assignment(cost)].mean())
+    expected = torch.tensor(cheapest).mean()
+    assert_close(sliced_wasserstein(some, others, directions), expected.double())
+
+
+def test_gradients_are_right():
+    some, others, directions = points(6, 3, 0), points(6, 3, 1), points(3, 4, 2)
+    assert torch.autograd.gradcheck(
+        lambda x: sliced_wasserstein(x, others, directions), some.requires_grad_()
+    )
+
+
+def test_what_the_sphere_does_not_see_counts_for_nothing():
+    logits, shift = points(20, 7, 0), points(20, 1, 1)
+
+    def loss(of, shift_free):
+        return latent_loss(of, shift_free, torch.Generator().manual_seed(3))
+
+    assert_close(loss(logits + shift, True), loss(logits, True))
+    assert loss(logits + shift, False) > 1.5 * loss(logits, False)
+
+
+def test_few_training_rooms_are_warned_of(toy_shards, monkeypatch):
+    stage = tiny_lifted(toy_shards).stages()[0]
+    rooms = stage.open_data()
+    count = len(rooms.plain_ids)
+    with pytest.warns(InputWarning, match=f"only {count} rooms, so new rooms will be implausible"):
+        stage.build(rooms, None)
+    monkeypatch.setattr("sceneprior.lifted.config.FEW_ROOMS", count)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", InputWarning)
+        stage.build(rooms, None)

@@ -68,13 +68,3 @@ def test_a_stop_flag_ends_a_scene_after_the_object_that_has_it(decoded, prior):
     first, second = scenes_of(stops, prior, "front3d_bedroom", ["a", "b"], "stop")
     assert labels(first) == ["double_bed", "nightstand"]
     assert labels(second) == ["double_bed", "nightstand", "wardrobe"]
-
-
-def test_nothing_complete_is_an_empty_room_and_no_vertices_are_boxes(decoded, prior):
-    none = replace(decoded, completeness_logits=-torch.ones(2, 4), vertices_m=None)
-    assert [scene.objects for scene in scenes_of(none, prior, "front3d_bedroom", ["a", "b"])] == [
-        (),
-        (),
-    ]
-    boxes = replace(decoded, vertices_m=None)
-    assert scenes_of(boxes, prior, "front3d_bedroom", ["a", "b"])[0].objects[0].mesh is None

@@ -1,6 +1,5 @@
 """Fitting latents: RMSProp as PyTorch has it, image by image, until nothing moves."""
 
-import itertools
 from dataclasses import replace
 
 import pytest
@@ -10,7 +9,6 @@ from torch.nn import functional as F
 from torch.testing import assert_close
 
 from sceneprior.core.observed_image import as_views, images_of_split
-from sceneprior.paper import fit_image as fitting
 from sceneprior.paper.fit_image import FitSchedule, decode_images, fit_latents_to_images, view_loss
 
 SHORT = FitSchedule(steps=12, drop_at=8, patience=0)
@@ -59,34 +57,6 @@ def test_images_that_do_not_move_stop_early_and_others_go_on(trained, views, sta
     eager = fit_latents_to_images(trained, views, start, replace(hopeless, patience=0))
     assert eager.steps.tolist() == [60] * len(start)
     assert (eager.loss.score <= fit.loss.score + 1e-6).all()
-
-
-def test_completeness_takes_no_part(trained, views, start):
-    scenes = decode_images(trained, start, views)
-    other = replace(scenes, completeness_logits=scenes.completeness_logits + 50)
-    one, two = (view_loss(trained, s, views, masks=False).total for s in (scenes, other))
-    assert torch.equal(one, two)
-
-
-def test_images_of_fewer_objects_go_on_when_the_full_ones_are_done(
-    trained, views, start, monkeypatch
-):
-    counts = views.is_object.sum(dim=1)
-    assert counts.min() < counts.max()  # so that those that go on are padded to fewer objects
-    full = {name for name, n in zip(views.room_ids, counts, strict=True) if n == counts.max()}
-    ages = itertools.count(1)
-
-    def staged(trained, scenes, views, *more):
-        """The full images never gain anything, the others do at every step."""
-        loss = view_loss(trained, scenes, views, *more)
-        score = [1.0 if name in full else 1.0 / next(ages) for name in views.room_ids]
-        return loss._replace(score=torch.tensor(score))
-
-    monkeypatch.setattr(fitting, "view_loss", staged)
-    fit = fit_latents_to_images(
-        trained, views, start, FitSchedule(50, 20, patience=20, least_gain=0.0)
-    )
-    assert fit.steps.tolist() == [40 if name in full else 50 for name in views.room_ids]
 
 
 def test_more_objects_than_the_prior_generates(trained, views, start):

@@ -82,20 +82,3 @@ def test_a_coordinate_of_the_cube_is_the_normal_distribution_function(torch_rng)
     assert_close(cube(logits), wanted, rtol=0, atol=1e-12)  # half its edge is sqrt(3 / 3)
     assert torch.autograd.gradcheck(cube, (logits.requires_grad_(),))
     assert not cube.state_dict()
-
-
-def test_what_the_cube_knows_of_near_between_and_steps(torch_rng):
-    cube = LatentCube(12)
-    z = cube(torch.randn(50, 12, generator=torch_rng, dtype=torch.float64))
-    near = cube.nearness(z[:2], z)
-    # cdist takes differences of squares for many points: half the digits.
-    assert_close(-near, (z[:2, None] - z).norm(dim=-1), rtol=0, atol=1e-6)
-    along = torch.tensor([0.0, 0.25], dtype=torch.float64)
-    points = cube.between(z[:2], z[2:4], along)
-    assert torch.equal(points[0], z[0])
-    assert_close(points[1], 0.75 * z[1] + 0.25 * z[3])
-    moved = cube.step(z, 0.3, 4)
-    assert torch.equal(moved, cube.step(z, 0.3, 4)) and not torch.equal(moved, cube.step(z, 0.3, 5))
-    assert moved.abs().max() <= cube.half_edge
-    length = (moved - z).norm(dim=-1)
-    assert 0.2 < length.mean() < 0.3  # about 0.3, less what the faces hold back

@@ -1,10 +1,10 @@
-"""Dropout: which numbers it drops, how often, and what that does to gradients."""
+"""Dropout: which numbers it drops; repeated linear layers: outputs and gradients of plain ones."""
 
 import pytest
 import torch
 from torch.testing import assert_close
 
-from sceneprior.paper.layers import dropout
+from sceneprior.paper.layers import RepeatedLinear, dropout
 
 
 @pytest.mark.parametrize("p", [0.1, 0.7])
@@ -37,3 +37,52 @@ def test_nothing_is_dropped_of_nothing_and_at_zero(torch_rng):
     x = torch.randn(3, 2, generator=torch_rng)
     assert torch.equal(dropout(x, 0.0), x)
     assert dropout(x[:0], 0.5).shape == (0, 2)
+
+
+ROWS = (2, 0, 5, 3)
+
+
+def layers(torch_rng, bias=True):
+    """Two groups of 4 inputs and 3 outputs, and an input for each use."""
+    shapes = [(2, 4, 3), (2, 3), *((2, rows, 4) for rows in ROWS)]
+    weight, biases, *inputs = (
+        torch.randn(shape, generator=torch_rng, dtype=torch.float64, requires_grad=True)
+        for shape in shapes
+    )
+    return weight, biases if bias else None, inputs
+
+
+def loss_of(outputs):
+    return sum((k * y.pow(3)).sum() for k, y in enumerate(outputs, 1))
+
+
+@pytest.mark.parametrize("bias", [True, False])
+@pytest.mark.parametrize("used", [len(ROWS), 2])
+def test_outputs_and_gradients_are_those_of_plain_layers(torch_rng, bias, used):
+    weight, biases, inputs = layers(torch_rng, bias)
+    leaves = [weight, *inputs[:used]] + ([biases] if bias else [])
+    plain = [x @ weight + (biases[:, None] if bias else 0) for x in inputs[:used]]
+    wanted = torch.autograd.grad(loss_of(plain), leaves)
+    layer = RepeatedLinear(weight, biases, ROWS)
+    found = [layer(x) for x in inputs[:used]]
+    assert_close(found, plain, rtol=0, atol=1e-13)
+    # Twice, and only in part in between: no gradient is left over from another pass.
+    for _ in range(2):
+        gradients = torch.autograd.grad(loss_of(found), leaves, retain_graph=True)
+        assert_close(gradients, wanted, rtol=0, atol=1e-12)
+        partial = torch.autograd.grad(loss_of(found[:1]), leaves[:1], retain_graph=True)
+        wanted_part = torch.autograd.grad(loss_of([inputs[0] @ weight + (
+            biases[:, None] if bias else 0)]), leaves[:1])  # fmt: skip
+        assert_close(partial, wanted_part, rtol=0, atol=1e-12)
+
+
+def test_gradcheck_confirms_the_gradients(torch_rng):
+    weight, biases, inputs = layers(torch_rng)
+
+    def outputs(weight, biases, *inputs):
+        layer = RepeatedLinear(weight, biases, ROWS)
+        first = layer(inputs[0])
+        # A later input depends on an earlier output, as in the transformer.
+        return first, *(layer(x + first.sum(dim=1, keepdim=True).mean()) for x in inputs[1:])
+
+    assert torch.autograd.gradcheck(outputs, (weight, biases, *inputs))

@@ -1,4 +1,4 @@
-"""Boxes from masks: near to the truth, exact on paper, defined where nothing is known."""
+"""Boxes and rays from masks: near to the truth, exact on paper, defined where nothing is known."""
 
 from dataclasses import replace
 
@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sceneprior.core.shards import iterate_rooms
-from sceneprior.lifted.lifting.boxes import RAYS, lift_boxes, own_rays, smallest_box
-from sceneprior.lifted.lifting.hulls import sightings_of
+from sceneprior.lifted.lifting.boxes import RAYS, draw_rays, lift_boxes, own_rays, smallest_box
+from sceneprior.lifted.lifting.hulls import pass_through, sightings_of
 
 
 @pytest.fixture(scope="module")
@@ -109,3 +109,37 @@ def test_rays_go_through_the_objects_own_pixels(rooms):
                 if is_clear] == [True] * int(clear.sum())  # fmt: skip
         checked += int(clear.sum())
     assert checked > 4
+
+
+MARGIN = 1.2
+
+
+def test_a_hit_meets_the_true_box_and_a_span_without_one_is_empty(rooms):
+    """Toy furniture fills its boxes. A ray is cast from a pixel's centre, and so was the id."""
+    views, truth = rooms[0]
+    boxes = lift_boxes(views)
+    pool = draw_rays(views, boxes, 300, MARGIN)
+    for item in np.flatnonzero(boxes.explained > 0):
+        scale = MARGIN * boxes.sizes_m[item] / 2
+        spans = pool.spans[item] * scale
+        length = np.linalg.norm(spans, axis=1)
+        known = length > 0
+        center_m, half_m = truth.centers_m[item].astype(float), truth.sizes_m[item] / 2.0
+        near, far = pass_through(
+            (pool.starts[item] * scale + boxes.centers_m[item])[known],
+            spans[known] / length[known, None],
+            center_m - half_m, center_m + half_m,
+        )  # fmt: skip
+        entered = np.where(far > near, near, np.inf)
+        hits = pool.hits[item][known]
+        assert 0.1 < hits.mean() < 0.9, "rays teach both ways"
+        met = entered <= length[known] + 1e-3
+        assert met[hits].mean() > 0.97 and (~met[~hits]).mean() > 0.97
+
+
+def test_passing_a_box_from_outside_inside_beside_and_along_a_side():
+    low, high = np.zeros(3), np.ones(3)
+    origins = np.array([[-1, 0.5, 0.5], [0.5, 0.5, 0.5], [-1, 2, 0.5], [-1, 0, 0.5], [2, 0.5, 0.5]])
+    near, far = pass_through(origins, np.tile([1.0, 0, 0], (5, 1)), low, high)
+    assert near[:2].tolist() == [1, 0] and far[:2].tolist() == [2, 0.5]
+    assert far[2] <= near[2] and (near[3], far[3]) == (1, 2) and far[4] <= near[4]

@@ -16,7 +16,7 @@ from sceneprior.core.classes import VOID
 from sceneprior.core.dataset import BLANK, ViewDataset, allowed_views
 from sceneprior.core.errors import ShardError
 from sceneprior.core.wall_lines import find_walls
-from sceneprior.lifted.lifting import ShapeGrid, boxes, cache, hulls, prototype_fitting
+from sceneprior.lifted.lifting import ShapeGrid, boxes, cache, prototype_fitting
 from sceneprior.lifted.lifting.dataset import LiftedDataset
 from sceneprior.lifted.prototypes import POSES, turn_of
 
@@ -78,17 +78,6 @@ def test_what_has_no_label_or_no_box_has_no_look(shards):
 def test_a_blank_draw_is_a_room_in_which_there_is_nothing(shards):
     batch = LiftedDataset(shards, "train", shape=GRID).__getitems__([(0, BLANK)])
     assert not batch.is_object.any() and not batch.is_lifted.any()
-
-
-def test_shapes_are_found_once_and_again_on_other_grids(shards, monkeypatch):
-    LiftedDataset(shards, "train", shape=GRID)
-    calls = []
-    find = hulls.lift_shapes
-    monkeypatch.setattr(hulls, "lift_shapes", lambda *given: calls.append(1) or find(*given))
-    LiftedDataset(shards, "train", shape=GRID)
-    assert calls == []
-    LiftedDataset(shards, "train", shape=GRID._replace(margin=1.3))
-    assert len(calls) == 6
 
 
 def test_parts_are_found_once_and_again_for_other_prototypes(shards, monkeypatch):

@@ -6,8 +6,6 @@ import trimesh
 from parts_of_rooms import CORNER, TABLE, boxes, rays_of
 
 from sceneprior.core.parts import (
-    ACROSS_X,
-    BOX,
     CYLINDER,
     MOST_CORNERS,
     Parts,
@@ -15,7 +13,7 @@ from sceneprior.core.parts import (
     surface_of_parts,
 )
 from sceneprior.lifted.lifting import RayPool
-from sceneprior.lifted.lifting.part_fit import close_slits, fit_parts, supports
+from sceneprior.lifted.lifting.part_fit import fit_parts
 from sceneprior.lifted.lifting.part_loss import RayFit
 from sceneprior.lifted.lifting.part_regularizers import area_table, gap_and_pieces, overhang
 
@@ -64,23 +62,6 @@ def test_nothing_floats():
     assert filled_cells(found, 64, 1.0)[:, 30].sum() <= 64, "a thin cord"
 
 
-def test_a_narrow_slit_between_a_part_and_its_image_is_closed_unless_rays_pass_it():
-    halves = Parts(
-        np.array([BOX]), np.array([ACROSS_X]),
-        np.array([[[-0.5, -0.03125], [-0.5, 0.5], [-0.5, 0.5]]]),
-    )  # fmt: skip
-    ends = np.rint((halves.ends + 0.5) * 64).astype(np.int64)
-    for count, closed in ((0, True), (4000, False)):
-        rays = rays_of(halves, 4000)
-        rays = RayPool(*(part[: max(count, 40)] for part in rays))
-        if not count:
-            rays = rays._replace(hits=np.ones(40, bool))
-        fit = RayFit(rays, MARGIN)
-        found = close_slits(fit, fit.guess(halves.kind, halves.mirrored, ends))
-        assert (found.mirrored[0] == 0) == closed
-        assert found.ends[0, 0].tolist() == ([0, 64] if closed else [0, 30])
-
-
 @pytest.mark.parametrize("foot", [(0, 8, 0, 56, 0, 8), (0, 20, 0, 56, 0, 64)], ids=["leg", "block"])
 def test_furniture_that_stands_does_not_tip_over(foot):
     """Masks show one leg of a table alone, or one side of a desk; an object that hangs may have
@@ -125,12 +106,3 @@ def test_a_round_bench_keeps_its_outline():
     vertices, faces = surface_of_parts(found)
     mesh = trimesh.Trimesh(vertices, faces)
     assert mesh.is_volume and mesh.volume == pytest.approx(np.pi / 4, rel=0.08)
-
-
-@pytest.mark.parametrize("first", [0, 30, 62])
-def test_what_stands_below_a_part_is_no_wider(first):
-    """Compiled code checks no index: an end beyond the last level would be read from elsewhere."""
-    ends = np.array([[first, first + 2], [20, 40], [first, first + 2]])
-    for _, below in supports(ends, hangs=False):
-        assert (below[[0, 2], 0] >= first).all() and (below[[0, 2], 1] <= first + 2).all()
-        assert (below[:, 0] < below[:, 1]).all() and below[1].tolist() == [0, 20]

@@ -1,7 +1,8 @@
-"""Rays against parts: every compiled count has a slow twin."""
+"""Rays against parts and outlines: every compiled count has a slow twin."""
 
 import numpy as np
 import pytest
+import shapely
 from parts_of_rooms import TABLE, rays_of
 
 from sceneprior.core.parts import ACROSS_X, ACROSS_Z, BOX, SQUARE, Parts, inside
@@ -10,9 +11,12 @@ from sceneprior.lifted.lifting.part_rays import count_wrong, descend, meets
 from sceneprior.lifted.lifting.part_regularizers import (
     LEVELS,
     area_table,
+    cut_rays,
     gap_and_pieces,
+    outline_of,
     overhang,
     planes_of,
+    points_within,
     volume_of,
 )
 
@@ -72,22 +76,6 @@ def test_a_face_goes_where_the_fewest_rays_are_wrong(mirrored):
             )  # fmt: skip
             assert fit.loss(one_sweep) <= fit.loss(guess) + 1
             assert trials[int(one_sweep.ends[1, 0, 0])] == pytest.approx(before)
-
-
-def test_moving_faces_never_makes_more_rays_wrong_and_keeps_the_counts():
-    fit = RayFit(rays_of(TABLE, 600), MARGIN)
-    rng = np.random.default_rng(3)
-    for _ in range(10):
-        low = rng.integers(0, 30, (3, 3))
-        ends = np.stack([low, low + rng.integers(2, 30, (3, 3))], axis=2)
-        kinds, mirrored = rng.integers(0, 5, 3), rng.integers(0, 4, 3)
-        guess = fit.guess(kinds, mirrored, ends)
-        moved = fit.refined(guess, range(3), 2)
-        assert fit.loss(moved) <= fit.loss(guess)
-        again = fit.guess(*moved[:3])
-        assert (again.covered == moved.covered).all() and (again.met_by == moved.met_by).all()
-        assert (moved.ends[..., 0] < moved.ends[..., 1]).all()
-        assert moved.ends.min() >= 0 and moved.ends.max() <= LEVELS
 
 
 def test_gaps_are_those_to_the_floor_or_the_ceiling():
@@ -154,3 +142,58 @@ def test_wrong_rays_of_several_objects_are_counted_at_once():
         levels = np.rint((ends + 0.5) * LEVELS).astype(np.int64)
         meets(starts * LEVELS + LEVELS / 2, spans * LEVELS, BOX, 0, levels, met)
         assert wrong[item] == ((met != rays.hits) & known).sum() > 30
+
+
+L_SHAPE = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.0], [0.0, 0.0], [0.0, 0.5], [-0.5, 0.5]])
+CELLS = 30
+
+
+def standing(seen) -> np.ndarray:
+    """A hull with this plan, between two heights."""
+    hull = np.zeros((CELLS,) * 3, bool)
+    hull[:, 4:9] = seen[:, None]
+    return hull
+
+
+def plan(shape: shapely.Polygon) -> np.ndarray:
+    middles = (np.arange(CELLS) + 0.5) / CELLS - 0.5
+    x, z = np.meshgrid(middles, middles, indexing="ij")
+    return shapely.contains_xy(shape, x, z)
+
+
+def test_an_outline_is_the_plan_of_the_hull():
+    found = outline_of(standing(plan(shapely.Polygon(L_SHAPE))))
+    shape, wanted = shapely.Polygon(found), shapely.Polygon(L_SHAPE)
+    assert shape.symmetric_difference(wanted).area < 0.005
+    assert all(found[:, axis].tolist().count(side) == 2 for axis in (0, 1) for side in (-0.5, 0.5))
+    assert shapely.Polygon(found).exterior.is_ccw
+
+
+def test_rays_are_cut_to_where_they_are_within_the_outline():
+    """Against points along each ray."""
+    rng = np.random.default_rng(1)
+    starts, stops = rng.uniform(-0.9, 0.9, (2, 400, 3))
+    starts[:20], stops[:20] = starts[:20] * 0.3, starts[:20] * 0.3 + [0, 0.4, 0]  # upright
+    spans = stops - starts
+    cut_starts, cut_spans = starts.copy(), spans.copy()
+    cut_rays(cut_starts, cut_spans, L_SHAPE)
+    along = np.linspace(0, 1, 4001)
+    polygon = shapely.Polygon(L_SHAPE)
+    met = 0
+    for start, span, cut_start, cut_span in zip(starts, spans, cut_starts, cut_spans, strict=True):
+        points = start + along[:, None] * span
+        inside = np.flatnonzero(shapely.contains_xy(polygon, points[:, ::2]))
+        if not len(inside):
+            assert np.linalg.norm(cut_span) < 2e-3
+            continue
+        met += 1
+        np.testing.assert_allclose(cut_start, points[inside[0]], atol=1e-3)
+        np.testing.assert_allclose(cut_start + cut_span, points[inside[-1]], atol=1e-3)
+    assert 100 < met < 390
+
+
+def test_points_lie_within_and_cover_the_outline():
+    points = points_within(L_SHAPE, 500)
+    assert shapely.contains_xy(shapely.Polygon(L_SHAPE), points).all() and len(points) == 500
+    shares = [((points > 0) == signs).all(axis=1).mean() for signs in ([0, 0], [0, 1], [1, 0])]
+    assert min(shares) > 0.25
