@@ -26,7 +26,7 @@ from data_prep.front.source import FrontSource
 from data_prep.homes.make import make_homes
 from data_prep.inspection.causes import GIVEN
 from data_prep.inspection.diagnosis import what_was_checked
-from data_prep.inspection.verify import verify
+from data_prep.inspection.verify import evidence_of, verify
 from data_prep.readers.posed.reader import Posed
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
@@ -219,7 +219,7 @@ def verdict(drawn: Draw, seed: int, out: Path) -> Verdict:
         found = verify(out / "shards")
     except InputError as error:
         return Verdict((f"refused: {error}",))
-    evidence = found.evidence
+    evidence = evidence_of(found.every)
     assert evidence is not None, "rooms with sound arrays have evidence"
     return Verdict(found.problems, evidence.share(GIVEN), bool(what_was_checked(evidence)[0]))
 

@@ -112,15 +112,15 @@ def shell(layout: Layout) -> list[tuple[str, np.ndarray]]:
     inner = [_wall(wall.start_m, wall.end_m, layout.height) for wall in walls]
     outer = [_wall(*each, layout.height) for each in ends]
     wall, middle = layout.door
-    door = [
+    start, end = (
         np.array(point_by(wall, middle + side * DOOR_M / 2, _BEFORE_WALL_M)) for side in (-1, 1)
-    ]
+    )
     return [
         ("Floor", tiles),
         ("Ceiling", ceiling),
         *(("WallInner", part) for part in inner),
         *(("WallOuter", part) for part in outer),
-        ("Door", _wall(*door, _DOOR_HEIGHT_M)),
+        ("Door", _wall(start, end, _DOOR_HEIGHT_M)),
     ]
 
 

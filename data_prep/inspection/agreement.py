@@ -1,8 +1,8 @@
 """Agreement between the projected 3D objects of a room's ground truth and their 2D masks."""
 
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
@@ -173,9 +173,18 @@ def box_iou_2d(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.divide(shared, union, out=np.full(union.shape, np.nan), where=union > 0)
 
 
-class Tally(NamedTuple):
-    """Sums over objects and views."""
+class Limits(NamedTuple):
+    """Minima of agreement: a share of the general ones, where at least so many masks count."""
 
+    share: float = 1.0
+    masks: int = 1
+
+
+class Tally(NamedTuple):
+    """Sums over objects and views, for one type of 3D representation."""
+
+    kind: str
+    """A key of `KINDS`."""
     masks: int = 0
     held: int = 0
     """Number of masks within their projections."""
@@ -191,45 +200,38 @@ class Tally(NamedTuple):
 
     @property
     def mean_iou(self) -> float:
-        """Mean IoU over the fully visible objects; NaN if there are none."""
-        return self.iou / self.whole if self.whole else float("nan")
+        """Mean IoU over the fully visible objects; 0 if there are none."""
+        return self.iou / max(self.whole, 1)
+
+    def passes(self, limits: Limits) -> bool:
+        """Test whether both measures reach the limits."""
+        share, iou = limits.share * HELD_AT_LEAST[self.kind], limits.share * IOU_AT_LEAST[self.kind]
+        held = self.masks < limits.masks or self.share >= share
+        return held and (self.whole < limits.masks or self.mean_iou >= iou)
 
 
-@dataclass(frozen=True)
-class Agreement:
-    """Sums of comparisons, by type of 3D representation."""
+Agreement = dict[str, Tally]
+"""Tallies by key of `KINDS`, for those that occur."""
 
-    tallies: dict[str, Tally] = field(default_factory=dict)
-    """Tally by key of `KINDS`, for those that occur."""
 
-    def __add__(self, other: "Agreement") -> "Agreement":
-        kinds = [kind for kind in KINDS if kind in self.tallies or kind in other.tallies]
-        pairs = {kind: zip(self.of(kind), other.of(kind), strict=True) for kind in kinds}
-        return Agreement({kind: Tally._make(map(sum, pair)) for kind, pair in pairs.items()})
+def added(agreements: Iterable[Agreement]) -> Agreement:
+    """Sum of agreements."""
+    total: Agreement = {}
+    for agreement in agreements:
+        for kind, tally in agreement.items():
+            before = total.get(kind, Tally(kind))
+            total[kind] = Tally(kind, *map(sum, zip(before[1:], tally[1:], strict=True)))
+    return {kind: total[kind] for kind in KINDS if kind in total}
 
-    def of(self, kind: str) -> Tally:
-        """Tally of one kind; empty if it does not occur."""
-        return self.tallies.get(kind, Tally())
 
-    @property
-    def score(self) -> float:
-        """Sum of both measures over the kinds."""
-        tallies = self.tallies.values()
-        return sum(tally.share + (tally.mean_iou if tally.whole else 0.0) for tally in tallies)
+def failing(agreement: Agreement, limits: Limits) -> list[Tally]:
+    """Tallies that do not pass."""
+    return [tally for tally in agreement.values() if not tally.passes(limits)]
 
-    def failing(self, share: float = 1.0, least: int = 1) -> list[str]:
-        """Kinds that do not pass."""
-        return [kind for kind in self.tallies if not self.passes(kind, share, least)]
 
-    def passes(self, kind: str, share: float = 1.0, least: int = 1) -> bool:
-        """Test whether both measures of a kind reach this share of the minima.
-
-        A measure counts only if it is taken over at least `least` masks.
-        """
-        tally = self.of(kind)
-        if tally.masks >= least and tally.share < share * HELD_AT_LEAST[kind]:
-            return False
-        return tally.whole < least or tally.mean_iou >= share * IOU_AT_LEAST[kind]
+def score(agreement: Agreement) -> float:
+    """Sum of both measures over the types of 3D representations."""
+    return sum(tally.share + tally.mean_iou for tally in agreement.values())
 
 
 class Comparison(NamedTuple):
@@ -256,8 +258,9 @@ class Comparison(NamedTuple):
             if (judged := self.judged & of).any():
                 held, whole = self.held & judged, self.whole & judged
                 iou = float(self.iou[whole].sum())
-                tallies[kind] = Tally(int(judged.sum()), int(held.sum()), int(whole.sum()), iou)
-        return Agreement(tallies)
+                counts = (int(flags.sum()) for flags in (judged, held, whole))
+                tallies[kind] = Tally(kind, *counts, iou)
+        return tallies
 
 
 def projections(room: Room) -> np.ndarray:

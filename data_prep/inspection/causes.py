@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from data_prep.inspection import messages
-from data_prep.inspection.agreement import Room, compare, compare_boxes, projections
+from data_prep.inspection.agreement import Room, compare, compare_boxes, projections, score
 from data_prep.inspection.camera_convention import (
     C2W,
     MOVED,
@@ -208,7 +208,7 @@ def _scaled(room: Room, _: Convention) -> Corrected:
     # Centres of 2D boxes are not exactly those of the objects, so the factor is refined.
     for step in (1.12, 1.04, 1.015):
         tried = [factor * step**k for k in (0, -1, 1, -2, 2)]
-        factor = max(tried, key=lambda factor: compare(scaled(factor)).agreement.score)
+        factor = max(tried, key=lambda factor: score(compare(scaled(factor)).agreement))
     yield Cause("unit", factor), scaled(factor)
 
 

@@ -11,8 +11,12 @@ from data_prep.inspection.agreement import (
     KINDS,
     Agreement,
     Comparison,
+    Limits,
     Room,
+    Tally,
+    added,
     compare,
+    score,
 )
 from data_prep.inspection.camera_convention import Convention
 from data_prep.inspection.causes import (
@@ -240,45 +244,39 @@ def what_was_checked(evidence: Evidence) -> tuple[list[str], list[str]]:
     return yes, no
 
 
-def disagreement(
-    agreement: Agreement,
-    kind: str,
-    rooms: Iterable[tuple[Room, Convention]],
-    share: float = 1.0,
-    least: int = 1,
-) -> str:
+def disagreement(tally: Tally, rooms: Iterable[tuple[Room, Convention]], limits: Limits) -> str:
     """State that masks and 3D objects disagree, and name the likely cause; no final full stop.
 
-    Corrections are tried on `rooms`. Both measures must reach `share` of their minima, where they
-    are taken over at least `least` masks.
+    Corrections are tried on `rooms`; the best that passes the limits is the cause.
     """
-    tally = agreement.of(kind)
     text = (
-        f"{tally.share:.0%} of {tally.masks} masks lie within the projected {KINDS[kind]}, "
-        f"expected at least {share * HELD_AT_LEAST[kind]:.0%}"
+        f"{tally.share:.0%} of {tally.masks} masks lie within the projected {KINDS[tally.kind]}, "
+        f"expected at least {limits.share * HELD_AT_LEAST[tally.kind]:.0%}"
     )
     if tally.whole:
         text += (
-            f", and those of unoccluded objects overlap with a mean 2D IoU of "
-            f"{tally.mean_iou:.2f}, expected at least {share * IOU_AT_LEAST[kind]:.2f}"
+            f", and those of unoccluded objects overlap with a mean 2D IoU of {tally.mean_iou:.2f}"
+            f", expected at least {limits.share * IOU_AT_LEAST[tally.kind]:.2f}"
         )
-    sums: dict[str, tuple[Cause, Agreement]] = {}
+    sums: dict[str, Agreement] = {}
+    names: dict[str, str] = {}
     for room, convention in rooms:
         for cause, other in corrections(room, convention).items():
             if TABLE[cause.name].with_truth:
                 sentence = sentence_of(cause, convention)
+                sums[sentence] = added([sums.get(sentence, {}), compare(other).agreement])
                 # Factors of different rooms differ by less than is printed: the first is kept.
-                first, before = sums.get(sentence, (cause, Agreement()))
-                sums[sentence] = first, before + compare(other).agreement
+                names.setdefault(sentence, TABLE[cause.name].corrected.format(cause.detail))
+    empty = Tally(tally.kind)
     good = {
-        sentence: found for sentence, found in sums.items() if found[1].passes(kind, share, least)
-    }
+        sentence: found for sentence, found in sums.items()
+        if found.get(tally.kind, empty).passes(limits)
+    }  # fmt: skip
     if not good:
         return f"{text}: is an axis or a unit wrong?"
-    best = max(good, key=lambda sentence: round(good[sentence][1].score, 2))  # the first of equals
-    cause, after = good[best][0], good[best][1].of(kind)
-    how = TABLE[cause.name].corrected.format(cause.detail)
-    text += f": {best}; {how}, {after.share:.0%} would"
+    best = max(good, key=lambda sentence: round(score(good[sentence]), 2))  # the first of equals
+    after = good[best].get(tally.kind, empty)
+    text += f": {best}; {names[best]}, {after.share:.0%} would"
     return text + (f", with a mean 2D IoU of {after.mean_iou:.2f}" if after.whole else "")
 
 

@@ -105,7 +105,7 @@ def _judged(checks: Sequence[RoomCheck]) -> list[str]:
             f"{tally.share:.1%} of {tally.masks}",
             f"{tally.mean_iou:.3f} of {tally.whole}" if tally.whole else "-",
         )
-        for kind, tally in agreement_of(checks).tallies.items()
+        for kind, tally in agreement_of(checks).items()
     ]
     fit = _fit(checks)
     of_truth = ["\n".join(lines) for lines in zip(*cells, strict=True)] or ["-"] * 3
@@ -114,10 +114,10 @@ def _judged(checks: Sequence[RoomCheck]) -> list[str]:
 
 def summary(found: FolderCheck) -> str:
     """State which checks a folder without problems has passed, and which were not possible."""
-    evidence = found.evidence
+    evidence = evidence_of(found.every)
     assert evidence is not None, "a folder without problems has evidence"
     yes, no = what_was_checked(evidence)
-    tallies = found.agreement.tallies
+    tallies = agreement_of(found.every)
     begin = "all is well" if yes or tallies else "nothing wrong is found, but little is checked"
     parts = [f"{begin}. Checksums, shapes, ranges, 2D boxes and masks agree"]
     if without := sum(not check.has_checksum for check in found.every):

@@ -7,7 +7,15 @@ from typing import Any
 
 from data_prep.engine.source import SPLITS
 from data_prep.engine.workers import pool
-from data_prep.inspection.agreement import Agreement, Room, compare, true_bodies
+from data_prep.inspection.agreement import (
+    Agreement,
+    Limits,
+    Room,
+    added,
+    compare,
+    failing,
+    true_bodies,
+)
 from data_prep.inspection.camera_convention import Convention, Conventions, read_conventions
 from data_prep.inspection.checks import array_problems, mask_problems, truth_problems
 from data_prep.inspection.diagnosis import (
@@ -28,9 +36,9 @@ _TRIED_ROOMS = 3
 """Number of rooms in which objects are found without ids, or corrections of ground truth are
 tried."""
 _NAMED_ROOMS = 5
-_OF_ROOM = {"share": 0.7, "least": 5}
-"""Share of the minima of agreement that each room must reach, so that one wrong room does not go
-unnoticed among many correct ones, and minimum number of masks for a statement about a room."""
+_ALL, _OF_ROOM = Limits(), Limits(share=0.7, masks=5)
+"""Minima of agreement for all rooms, and for each, so that one wrong room does not go unnoticed
+among many correct ones."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +53,7 @@ class RoomCheck:
     """Problems as sentences, without the room's name."""
     evidence: Evidence | None = None
     """Evidence about cameras and ids; None if the arrays are faulty."""
-    agreement: Agreement = field(default_factory=Agreement)
+    agreement: Agreement = field(default_factory=dict)
     """Agreement of ground truth and masks."""
     outliers: tuple[str, ...] = ()
     """Views and objects that disagree with the ground truth, as sentences."""
@@ -66,16 +74,6 @@ class FolderCheck:
         """Rooms of all splits."""
         return [room for rooms in self.rooms.values() for room in rooms]
 
-    @property
-    def agreement(self) -> Agreement:
-        """Agreement summed over all rooms."""
-        return agreement_of(self.every)
-
-    @property
-    def evidence(self) -> Evidence | None:
-        """Combined evidence of all rooms; None if there is none."""
-        return evidence_of(self.every)
-
 
 def evidence_of(checks: Sequence[RoomCheck]) -> Evidence | None:
     """Combined evidence of rooms; None if there is none."""
@@ -85,7 +83,7 @@ def evidence_of(checks: Sequence[RoomCheck]) -> Evidence | None:
 
 def agreement_of(checks: Sequence[RoomCheck]) -> Agreement:
     """Agreement summed over rooms."""
-    return sum((check.agreement for check in checks), Agreement())
+    return added(check.agreement for check in checks)
 
 
 def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> FolderCheck:
@@ -177,22 +175,21 @@ def _mistakes_in_3d(
 ) -> list[str]:
     """Sentences about ground truth and masks, in all rooms together or in single ones."""
 
-    def said(agreement: Agreement, checks: Sequence[RoomCheck], **limits: Any) -> list[str]:
-        if not (kinds := agreement.failing(**limits)):
+    def said(checks: Sequence[RoomCheck], limits: Limits, tried: Sequence[RoomCheck]) -> list[str]:
+        if not (wrong := failing(agreement_of(checks), limits)):
             return []
-        first = checks[:_TRIED_ROOMS]
-        tried = [(_read(folder, check), conventions.of(check.room_id)) for check in first]
-        return [disagreement(agreement, kind, tried, **limits) for kind in kinds]
+        read = [(_read(folder, c), conventions.of(c.room_id)) for c in tried[:_TRIED_ROOMS]]
+        return [disagreement(tally, read, limits) for tally in wrong]
 
     sentences = []
-    wrong = [room for room in rooms if room.agreement.failing()]
+    wrong = [room for room in rooms if failing(room.agreement, _ALL)]
     if 2 * len(wrong) <= len(rooms):
         for room in rooms:
             where = f"{folder / room.shard}, room {room.room_id}"
-            found = said(room.agreement, [room], **_OF_ROOM) or room.outliers
+            found = said([room], _OF_ROOM, [room]) or room.outliers
             sentences += [f"{where}: {sentence}." for sentence in found]
     if not sentences:
-        sentences = [f"{folder}: {sentence}." for sentence in said(agreement_of(rooms), wrong)]
+        sentences = [f"{folder}: {sentence}." for sentence in said(rooms, _ALL, wrong)]
     return [text.replace("?.", "?") for text in sentences]
 
 
@@ -265,7 +262,7 @@ def _check_room(
         return check
     bodies, found = true_bodies(views, truth, folder)
     seen = compare(Room(views, bodies))
-    odd = () if seen.agreement.failing(**_OF_ROOM) else outliers(seen)
+    odd = () if failing(seen.agreement, _OF_ROOM) else outliers(seen)
     return replace(
         check, problems=(*problems, *found), agreement=seen.agreement, outliers=tuple(odd)
     )

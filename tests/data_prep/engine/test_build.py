@@ -15,7 +15,7 @@ from data_prep.engine.build import Job, build_shards, read_finished
 from data_prep.front.recipe import load_recipe
 from data_prep.front.source import FrontSource
 from data_prep.inspection.agreement import true_bodies
-from data_prep.inspection.verify import verify
+from data_prep.inspection.verify import agreement_of, verify
 from sceneprior.core.classes import label_set
 from sceneprior.core.shards import read_index
 
@@ -142,7 +142,7 @@ def test_houses_made_by_others(tmp_path):
     names = [label_set("front3d_bedroom")[c] for c in views.object_class]
     assert names.count("double_bed") == 1 and "armchair" in names and "void" not in names
     found = verify(tmp_path / "a")
-    tally = found.agreement.of("mesh")
+    tally = agreement_of(found.every)["mesh"]
     assert found.problems == () and tally.whole > 3 and tally.mean_iou > 0.95
 
 

@@ -11,14 +11,16 @@ from data_prep.front.viewpoints import camera_pose
 from data_prep.inspection.agreement import (
     MARGIN,
     NEAR_M,
-    Agreement,
     Hull,
+    Limits,
     Room,
     Tally,
+    added,
     box_iou_2d,
     boxes_around,
     compare,
     compare_boxes,
+    failing,
     hull_of,
     hull_of_model,
     true_bodies,
@@ -48,7 +50,7 @@ def test_a_right_room_agrees_to_the_pixel(made):
     seen = compare(room)
     assert problems == [] and set(seen.kinds) == {"mesh"} and (seen.judged == views.visible).all()
     assert seen.iou[seen.judged & seen.whole].min() > 0.85
-    tally = seen.agreement.of("mesh")
+    tally = seen.agreement["mesh"]
     # What is hidden in part lies within its projection, too.
     assert tally.share == 1.0 and tally.masks == views.visible.sum() and tally.mean_iou > 0.95
     height, width = views.image_size
@@ -65,7 +67,7 @@ def test_without_meshes_the_boxes_stand_for_them(made):
     bare = replace(truth, model_ids=("",) * len(truth.model_ids))
     room, problems = room_of(views, bare, shards)
     # These pieces are boxes themselves, though some are turned in theirs.
-    tally = compare(room).agreement.of("box")
+    tally = compare(room).agreement["box"]
     assert problems == [] and tally.share == 1.0 and tally.mean_iou > 0.85
 
 
@@ -76,10 +78,10 @@ def test_what_is_undefined_disagrees_and_the_margin_is_what_it_says(made):
     margin = MARGIN * room.size_px[0]
     for grow, share in ((0.0, 1.0), (-0.99 * margin, 1.0), (-1.01 * margin, 0.0), (50, 1.0)):
         wider = boxes + np.array([-grow, -grow, grow, grow])
-        assert compare_boxes(room, wider).agreement.of("mesh").share == share
-    behind = compare_boxes(room, np.full(boxes.shape, np.nan)).agreement.of("mesh")
+        assert compare_boxes(room, wider).agreement["mesh"].share == share
+    behind = compare_boxes(room, np.full(boxes.shape, np.nan)).agreement["mesh"]
     assert behind.masks == views.visible.sum() and behind.share == behind.mean_iou == 0.0
-    assert Agreement({"mesh": behind}).failing() == ["mesh"]
+    assert failing({"mesh": behind}, Limits()) == [behind]
 
 
 def test_models_that_are_missing_or_damaged_are_named(made, tmp_path):
@@ -99,12 +101,13 @@ def test_models_that_are_missing_or_damaged_are_named(made, tmp_path):
 
 
 def test_agreements_add_up():
-    first, second = Tally(4, 3, 2, 1.5), Tally(6, 6)
-    total = Agreement({"box": first}) + Agreement({"box": second, "mesh": second})
-    assert total.tallies == {"mesh": second, "box": Tally(10, 9, 2, 1.5)}
-    assert total.of("box").share == 0.9 and total.of("box").mean_iou == 0.75
-    assert total.failing() == [] and Agreement({"box": first}).failing() == ["box"]
-    assert Agreement({"box": first}).failing(least=5) == [] and np.isnan(second.mean_iou)
+    first, second = Tally("box", 4, 3, 2, 1.5), Tally("box", 6, 6)
+    meshes = Tally("mesh", 6, 6)
+    total = added([{"box": first}, {"mesh": meshes, "box": second}])
+    assert total == {"mesh": meshes, "box": Tally("box", 10, 9, 2, 1.5)}
+    assert total["box"].share == 0.9 and total["box"].mean_iou == 0.75
+    assert failing(total, Limits()) == [] and failing({"box": first}, Limits()) == [first]
+    assert failing({"box": first}, Limits(masks=5)) == []
 
 
 def test_a_mirrored_truth_does_not_agree(made):
@@ -112,9 +115,9 @@ def test_a_mirrored_truth_does_not_agree(made):
     mirror = np.diag([-1.0, 1, 1, 1])
     moved = replace(truth, model_to_room=(mirror @ truth.model_to_room).astype(np.float32))
     room, problems = room_of(views, moved, shards)
-    tally = compare(room).agreement.of("mesh")
+    tally = compare(room).agreement["mesh"]
     assert tally.masks == views.visible.sum() and tally.mean_iou < 0.6
-    assert Agreement({"mesh": tally}).failing() == ["mesh"]
+    assert failing({"mesh": tally}, Limits()) == [tally]
     assert len(problems) >= 2 and "m from the box around its placed mesh" in problems[0]
 
 

@@ -16,7 +16,7 @@ from mutations import scaled
 from data_prep.inspection.camera_convention import read_conventions
 from data_prep.inspection.diagnosis import find_mistake
 from data_prep.inspection.tables import summary
-from data_prep.inspection.verify import verify
+from data_prep.inspection.verify import evidence_of, verify
 from sceneprior.core.errors import InputError
 
 MIRROR = np.diag([1.0, -1, 1, 1])
@@ -150,6 +150,6 @@ def test_right_captures_pass_and_a_floor_at_the_wrong_height_is_named(captures, 
     shards = shards_of(captures, tmp_path / "shards")
     found, (conventions, _) = verify(shards), read_conventions(shards, "posed")
     assert found.problems == ()
-    high = found.evidence._replace(floor_m=0.4)
+    high = evidence_of(found.every)._replace(floor_m=0.4)
     said = find_mistake(high, conventions.usual, lambda: pytest.fail("no doubt")).sentence
     hold("mistakes", {"nothing": summary(found), "floor": said}, slack=0.02)

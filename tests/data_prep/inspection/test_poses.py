@@ -9,7 +9,7 @@ from golden import hold
 from mutations import KINDS, OPENGL, longer, mutated, scaled, swapped
 
 from data_prep.inspection.causes import GIVEN
-from data_prep.inspection.verify import verify
+from data_prep.inspection.verify import agreement_of, evidence_of, verify
 
 Z_UP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
 WRONG = {
@@ -38,9 +38,10 @@ def shards(made_once):
 def test_right_cameras_pass(shards, kind):
     found = verify(shards(kind))
     assert found.problems == ()
-    assert found.evidence.share(GIVEN) > 0.75 or found.evidence.spare < 12
+    evidence = evidence_of(found.every)
+    assert evidence.share(GIVEN) > 0.75 or evidence.spare < 12
     if kind != "posed":
-        (tally,) = found.agreement.tallies.values()
+        (tally,) = agreement_of(found.every).values()
         # Also masks that something hides in part, and those at the image's border.
         assert tally.masks > 2 * tally.whole > 0 and tally.share == 1.0
 

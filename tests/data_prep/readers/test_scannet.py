@@ -34,7 +34,7 @@ from data_prep.engine.build import Job, build_shards
 from data_prep.engine.source import Line, RoomTask
 from data_prep.engine.workers import pool
 from data_prep.inspection.agreement import box_iou_2d, boxes_around, hull_of, true_bodies
-from data_prep.inspection.verify import verify
+from data_prep.inspection.verify import agreement_of, verify
 from data_prep.readers.labels import read_labels
 from data_prep.readers.mask_zip import MaskArchive
 from data_prep.readers.rooms import prepare_room
@@ -468,7 +468,7 @@ def checked(right, tmp_path):
 def test_a_right_scan_passes_with_a_high_iou(checked, right, tmp_path):
     found = checked()
     assert found.problems == ()
-    tally = found.agreement.of("mesh")
+    tally = agreement_of(found.every)["mesh"]
     assert tally.share > 0.98 and tally.whole >= 10 and tally.mean_iou > 0.95
     (path,) = (tmp_path / "shards").glob("*/*.h5")
     with Shard(path) as shard:
@@ -477,7 +477,7 @@ def test_a_right_scan_passes_with_a_high_iou(checked, right, tmp_path):
         assert shard.read_checksum("scene0000_00") == room_checksum(views, truth)
     assert truth.unoccluded.shape == views.visible.shape
     # Walls, the door and the pillar hide what masks alone take to be whole.
-    assert found.agreement.of("mesh").whole < (views.sides_clear.all(axis=2)).sum() / 2
+    assert agreement_of(found.every)["mesh"].whole < (views.sides_clear.all(axis=2)).sum() / 2
     # Box and surface end at the same places: corners at ragged borders have no triangle of their
     # own, but are the object's.
     assert true_bodies(views, truth, tmp_path / "shards")[1] == []
