@@ -72,3 +72,10 @@ def make_room(room_id: str, rng: np.random.Generator) -> tuple[RoomViews, RoomGr
         image_size=(60, 80),
     )
     return views, truth
+
+
+@pytest.fixture
+def two_sets(rng) -> tuple[np.ndarray, np.ndarray]:
+    """Two sets of features."""
+    turn = rng.normal(size=(12, 12))
+    return rng.normal(size=(40, 12)) @ turn, rng.normal(size=(30, 12)) @ turn + 0.5

@@ -1,6 +1,5 @@
 """The whole evaluation on toy rooms: keys, protocol, fairness, refusals."""
 
-import hashlib
 import io
 import json
 import shutil
@@ -15,8 +14,6 @@ from sceneprior.core.errors import InputError, ShardError
 from sceneprior.core.files import write_json
 from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.scene import Scene, SceneObject
-from sceneprior.evaluation import synthesis
-from sceneprior.evaluation.metrics import picture_classifiers
 from sceneprior.evaluation.score_table import headings, print_scores, score_rows
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
 from sceneprior.render.offscreen import SoftwareRenderer
@@ -96,25 +93,6 @@ def test_odd_sets_of_rooms_have_metrics_or_none_but_never_nan(shards, no_classif
         cells = {row[0]: row[2] for row in score_rows(scores)}
         assert cells["Pieces out of the floor's bounds"] == "–"
     assert evaluate_synthesis([empty] * 2, shards, EvalOptions(resamples=0))["type_share"] == 0
-
-
-def test_the_papers_classifier_appears_with_its_weights(
-    generated, shards, tmp_path, monkeypatch, no_classifier
-):
-    seen = []
-
-    def stand_in(path, pictures, labels, others, seed):
-        seen.append((pictures.shape[1:], pictures.dtype))
-        return np.zeros(len(others), dtype=int)
-
-    path = tmp_path / "alexnet.pth"
-    path.write_bytes(b"weights")
-    monkeypatch.setattr(synthesis, "check_alexnet", lambda path: None)
-    monkeypatch.setattr(picture_classifiers, "classify_pictures", stand_in)
-    scores = evaluate_synthesis(generated, shards, EvalOptions(alexnet=path, resamples=5))
-    assert scores["sca"] == scores["train_rooms"]["sca"] == 0.5
-    assert set(seen) == {((224, 224, 3), np.dtype("uint8"))}
-    assert scores["protocol"]["sca"]["sha256"] == hashlib.sha256(b"weights").hexdigest()
 
 
 def test_val_rooms_are_compared_with_where_settings_are_chosen(

@@ -1,14 +1,27 @@
-"""Metrics of use on rooms made by hand, whose values are known."""
+"""Metrics of use on rooms with known values, and their geometry beside plain twins and trimesh."""
 
 import itertools
 
 import numpy as np
 import pytest
 import trimesh
+from references.surfaces import triangles_meet, winding
+from rooms_of_solids import solid_box
 
-from sceneprior.core.scene import Mesh, Opening, Scene, SceneObject, Turned
+from sceneprior.apps.api import load
+from sceneprior.core.contact_resolution import make_stable
+from sceneprior.core.scene import Mesh, Opening, Scene, SceneObject, Solid, Turned
 from sceneprior.evaluation.metrics.collisions import colliding, containing
+from sceneprior.evaluation.metrics.stability import settle, stable_count
 from sceneprior.evaluation.metrics.support import supported
+from sceneprior.evaluation.surfaces import (
+    edge_hits,
+    inside,
+    meeting_pairs,
+    triangles_of,
+    vertical_crossings,
+    voxelize,
+)
 from sceneprior.evaluation.use import UseOptions, measure_room, measure_use
 
 FLOOR = np.array([[-2.0, -1.5], [2, -1.5], [2, 1.5], [-2, 1.5]])
@@ -205,3 +218,94 @@ def test_symmetries_change_nothing():
         assert other[key] == pytest.approx(plain[key], rel=near, abs=near), key
     for order in itertools.permutations(made):
         assert measure_room(room(*order), UseOptions("none"))["sceneeval_col_objects"] == (2, 3)
+
+
+def blob() -> np.ndarray:
+    """Two closed bodies that overlap, as triangles."""
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.6)
+    tube = trimesh.creation.cylinder(radius=0.3, height=2.0)
+    return np.concatenate([ball.triangles, tube.triangles])
+
+
+def test_points_are_inside_where_the_winding_number_is_not_zero(rng):
+    surface = blob()
+    points = rng.uniform(-0.9, 0.9, (120, 3))
+    by_hand = [abs(winding(point, surface)) > 0.5 for point in points]
+    assert 10 < sum(by_hand) < 110
+    assert inside(points, surface).tolist() == by_hand
+    assert inside(points, surface[:, ::-1]).tolist() == by_hand  # all triangles turned over
+
+
+def test_lines_through_shared_edges_cross_a_box_twice():
+    box = triangles_of(SceneObject("desk", (0.0, 0.5, 0.0), (1.0, 1.0, 1.0)))
+    found = vertical_crossings(np.array([[0.0, 5.0, 0.0], [0.25, 5.0, 0.25]]), box)
+    assert np.bincount(found.point).tolist() == [2, 2]
+    assert sorted(found.height_m[found.point == 0]) == [0.0, 1.0]
+    assert found.side[np.argsort(found.height_m)].tolist() == [-1, -1, 1, 1]
+
+
+def test_triangles_meet_where_an_edge_passes_through(rng):
+    a, b = rng.uniform(-1, 1, (2, 40, 3, 3))
+    by_hand = {(i, j) for i in range(40) for j in range(40) if triangles_meet(a[i], b[j])}
+    pairs = meeting_pairs(a, b)
+    assert len(by_hand) > 50 and {tuple(pair) for pair in pairs.tolist()} == by_hand
+    hits = edge_hits(a[pairs[:, 0]], b[pairs[:, 1]])
+    assert len(hits) == 2 * len(pairs)  # a segment has two ends
+
+
+def test_coplanar_triangles_meet_only_if_they_overlap():
+    flat = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 0, 1]]])
+    assert len(meeting_pairs(flat, flat)) == 1
+    assert len(meeting_pairs(flat, flat + np.array([0.9, 0, 0]))) == 1
+    assert len(meeting_pairs(flat, flat + np.array([0.6, 0, 0.6]))) == 0
+    assert len(meeting_pairs(flat, flat + np.array([0, 1e-9, 0]))) == 0
+
+
+@pytest.mark.parametrize("pitch_m", [0.05, 0.11])
+def test_voxels_are_those_of_trimesh(pitch_m):
+    for mesh in (
+        trimesh.creation.icosphere(subdivisions=2, radius=0.43),
+        trimesh.creation.box((0.61, 0.37, 1.03)),
+        trimesh.creation.cylinder(radius=0.21, height=0.83),
+    ):
+        theirs = mesh.voxelized(pitch_m).fill()
+        ours = voxelize(np.asarray(mesh.triangles), pitch_m)
+        assert ours.cells.shape == theirs.matrix.shape
+        assert np.allclose(ours.first * pitch_m, theirs.translation)
+        # Points of the two divisions differ, so cells that a surface cuts at a corner may.
+        assert (ours.cells != theirs.matrix).mean() < 0.02
+
+
+pytest.importorskip("mujoco", reason="no mujoco here: pip install -e '.[sim]'")
+
+
+def test_floating_and_leaning_objects_are_not_stable():
+    standing = solid_box("nightstand", (0, 0.3, 0), (0.5, 0.6, 0.5))
+    floating = solid_box("nightstand", (1, 0.35, 0), (0.5, 0.6, 0.5))
+    lamp = solid_box("pendant_lamp", (0, 2.2, 0), (0.4, 0.4, 0.4))
+    board = Solid("box", (1.75, 0.5, -0.25), (2.25, 0.6, 0.25))
+    leg = Solid("box", (1.75, 0.0, -0.25), (1.8, 0.5, 0.25))
+    leaning = SceneObject("table", (2.0, 0.3, 0.0), (0.5, 0.6, 0.5), solids=(board, leg))
+    found = settle(Scene("room", "front3d_bedroom", (standing, floating, lamp, leaning)))
+    assert found.stable.tolist() == [True, False, True, False]
+    assert found.moved_m[1] == pytest.approx(0.05, abs=2e-3)  # it falls to the floor
+    assert found.turned_rad[3] > 0.5
+    assert found.penetration_m < 1e-6
+
+
+def test_overlaps_at_the_start_are_measured():
+    """Two boxes 10 cm into each other."""
+    pair = (solid_box("table", (0, 0.5, 0), (1, 1, 1)), solid_box("desk", (0.9, 0.5, 0), (1, 1, 1)))
+    assert settle(Scene("room", "front3d_bedroom", pair), 0.01).penetration_m == pytest.approx(0.1)
+    assert stable_count(Scene("room", "front3d_bedroom", pair))["stable_share"] < (2, 2)
+    assert stable_count(Scene("room", "front3d_bedroom"))["stable_share"] == (0, 0)
+
+
+@pytest.mark.parametrize("name", ["procthor-bedroom", "procthor-living", "demo-bedroom"])
+def test_rooms_of_shipped_priors_stand_still(name):
+    """8 rooms of each prior: at least 97% of objects stay, and nothing overlaps at the start."""
+    rooms = [make_stable(room)[0] for room in load(name).sample(8, seed=1)]
+    found = [settle(room) for room in rooms]
+    assert max(one.penetration_m for one in found) <= 1e-3
+    stable = np.concatenate([one.stable for one in found])
+    assert stable.mean() >= 0.97

