@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.evaluation.metrics.floor import AGENT_RADIUS_M, outside_count, walkable_share
 
@@ -76,9 +75,3 @@ def test_a_raster_of_discs_agrees(rng):
         # Cells of 1 cm along about 10 m of edges, on 1 to 4 m2.
         assert exact == pytest.approx(by_hand, abs=0.03)
     assert seen_parted >= 2
-
-
-def test_a_floor_without_area_is_a_sentence():
-    for floor in (np.zeros((4, 2)), np.zeros((2, 2)), np.zeros((4, 3))):
-        with pytest.raises(InputError, match="The floor of scene 'a' has no area"):
-            outside_count(room(floor=floor))

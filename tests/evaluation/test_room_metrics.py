@@ -10,7 +10,6 @@ from scipy.stats import wasserstein_distance
 from toy_metrics import compared_with, of_classes, room, room_set
 
 from sceneprior.core.classes import label_set
-from sceneprior.core.errors import InputError
 from sceneprior.core.overlaps import box_iou_3d, match_scenes
 from sceneprior.core.scene import Scene
 from sceneprior.evaluation.metric import Comparison
@@ -18,7 +17,6 @@ from sceneprior.evaluation.metrics import METRICS
 from sceneprior.evaluation.metrics.contents import (
     category_kl_of_counts,
     class_counts,
-    common_label_set,
     reconstruction_scores,
 )
 from sceneprior.evaluation.metrics.novelty import near_copy_threshold
@@ -46,16 +44,6 @@ def test_category_kl_by_hand():
     # The epsilon of 1e-6 moves each logarithm by at most 4e-6.
     assert kl(generated, test) == pytest.approx(by_hand, abs=4e-6)
     assert kl(test, test) == 0
-
-
-def test_scenes_of_different_label_sets_are_not_compared():
-    living = Scene("a", "front3d_living", ())
-    with pytest.raises(
-        InputError, match="but label sets front3d_bedroom, front3d_living were given"
-    ):
-        common_label_set([living], [of_classes("desk")])
-    with pytest.raises(InputError, match="no scenes were given"):
-        class_counts([])
 
 
 def test_iou_agrees_with_volumes_counted_on_a_grid():
