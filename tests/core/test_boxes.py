@@ -1,12 +1,23 @@
-"""Corners and edges of boxes: by hand, and the same in numpy and torch."""
+"""Corners of boxes, rotations, and template meshes."""
 
 import itertools
 
 import numpy as np
+import pytest
 import torch
+from scipy.spatial import ConvexHull
 from torch.testing import assert_close
 
-from sceneprior.core.boxes import BOX_EDGES, box_corners
+from sceneprior.core.boxes import (
+    BOX_EDGES,
+    CUBE_CORNERS,
+    QUARTERS,
+    box_corners,
+    quarter_rotation,
+    turn_vectors,
+    yaw_rotation,
+)
+from sceneprior.core.meshes import beveled_cube, icosphere, place, to_cube
 
 
 def test_box_corners_are_center_plus_minus_half_a_size():
@@ -28,3 +39,89 @@ def test_edges_join_corners_that_differ_in_one_coordinate():
     corners = box_corners(np.array([1.0, 2, 3]), np.array([2.0, 4, 6]))
     lengths = sorted(np.linalg.norm(corners[a] - corners[b]) for a, b in BOX_EDGES)
     assert lengths == [2] * 4 + [4] * 4 + [6] * 4
+
+
+def test_a_yaw_turns_z_towards_x():
+    many = yaw_rotation(np.array([[0.3], [-2.0]]))
+    assert many.shape == (2, 1, 3, 3)
+    np.testing.assert_allclose(many[0, 0] @ [0, 0, 1], [np.sin(0.3), 0, np.cos(0.3)], atol=1e-16)
+    np.testing.assert_allclose(many[1, 0] @ many[1, 0].T, np.eye(3), atol=1e-16)
+    assert np.linalg.det(many[1, 0]) == pytest.approx(1)
+    np.testing.assert_array_equal(yaw_rotation(-2.0), many[1, 0])
+
+
+@pytest.mark.parametrize("quarters", range(-1, 6))
+def test_a_quarter_rotation_is_a_yaw_without_rounding(quarters):
+    turn = quarter_rotation(quarters)
+    np.testing.assert_allclose(turn, yaw_rotation(quarters * np.pi / 2), atol=1e-14)
+    assert set(np.unique(turn)) == {0.0, 1.0} | ({-1.0} if quarters % QUARTERS else set())
+
+
+def test_vectors_turn_as_their_rotation_says(torch_rng):
+    vectors = torch.randn(QUARTERS, 5, 2, 3, generator=torch_rng, dtype=torch.float64)
+    turned = turn_vectors(vectors, torch.arange(QUARTERS))
+    for quarters in range(QUARTERS):
+        by_matrix = vectors[quarters] @ torch.from_numpy(quarter_rotation(quarters)).T
+        assert torch.equal(turned[quarters], by_matrix)
+
+
+@pytest.mark.parametrize("level", [0, 1, 2, 4])
+def test_icosphere_is_a_closed_unit_sphere_of_known_size(level):
+    vertices, faces = icosphere(level)
+    assert len(faces) == 20 * 4**level
+    assert len(vertices) == 10 * 4**level + 2  # Euler: V - E + F = 2 with E = 3 F / 2
+    assert_close(vertices.norm(dim=-1), torch.ones(len(vertices)), rtol=0, atol=1e-6)
+    edges = torch.cat([faces[:, (0, 1)], faces[:, (1, 2)], faces[:, (2, 0)]])
+    # Closed and consistently wound: each edge is walked once each way.
+    walked = {tuple(edge) for edge in edges.tolist()}
+    assert len(walked) == len(edges)
+    assert all((b, a) in walked for a, b in walked)
+    a, b, c = vertices[faces].unbind(dim=1)
+    outward = (torch.linalg.cross(b - a, c - a) * (a + b + c)).sum(-1)
+    assert (outward > 0).all()
+
+
+@pytest.mark.parametrize("level", [0, 1, 3])
+def test_to_cube_lands_on_the_cube_in_the_same_direction(level):
+    sphere, _ = icosphere(level)
+    cube = to_cube(sphere)
+    assert_close(cube.abs().amax(dim=-1), torch.ones(len(cube)), rtol=0, atol=1e-6)
+    assert_close(cube / cube.norm(dim=-1, keepdim=True), sphere, rtol=0, atol=1e-6)
+    assert_close(cube.amin(dim=0), -torch.ones(3), rtol=0, atol=1e-6)
+    assert_close(cube.amax(dim=0), torch.ones(3), rtol=0, atol=1e-6)
+
+
+def test_a_beveled_cube_without_bevels_is_the_cube():
+    vertices = beveled_cube(torch.zeros(2, 5, 2))
+    assert vertices.shape == (2, 5, 32, 3)
+    assert {tuple(v) for v in vertices[1, 3].tolist()} == set(itertools.product((-1, 1), repeat=3))
+
+
+@pytest.mark.parametrize(
+    "upright, level, volume",
+    [
+        (0.0, 0.0, 8.0),
+        (1.0, 0.0, 4.0),  # a prism over the diamond of area 2
+        (1.0, 1.0, 4 / 3),  # an octahedron
+        # Below |y| = 1 - b the octagon of area 4 - 2 a^2; above it shrinks evenly to 1 - b of it.
+        (0.4, 0.5, (4 - 2 * 0.4**2) * 2 * (0.5 + 0.5 * (1 + 0.5 + 0.25) / 3)),
+    ],
+)
+def test_a_beveled_cube_touches_all_six_sides_and_has_its_volume(upright, level, volume):
+    vertices = beveled_cube(torch.tensor([upright, level], dtype=torch.float64))
+    one = torch.ones(3, dtype=torch.float64)
+    assert_close(vertices.amax(dim=0), one)
+    assert_close(vertices.amin(dim=0), -one)
+    assert ConvexHull(vertices.numpy()).volume == pytest.approx(volume)
+
+
+def test_gradients_of_bevels_in_double_precision():
+    bevels = torch.tensor([[0.2, 0.7], [0.5, 0.1]], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(beveled_cube, bevels)
+
+
+def test_place_puts_the_unit_cube_into_the_box():
+    centers = torch.tensor([[[1.0, 2, 3], [0, 0.5, 0]]], dtype=torch.float64)
+    sizes = torch.tensor([[[0.2, 4, 6], [1, 1, 2]]], dtype=torch.float64)
+    cube = centers.new_tensor(CUBE_CORNERS).expand(1, 2, 8, 3)
+    assert_close(place(cube, centers, sizes), box_corners(centers, sizes), rtol=0, atol=1e-15)

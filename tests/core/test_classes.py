@@ -1,10 +1,17 @@
-"""Label sets, shipped and of one's own, and the colours of their classes."""
+"""Label sets, the classes of models, colours, and seeds."""
+
+import json
 
 import numpy as np
 import pytest
 
+import sceneprior
+from sceneprior.apps.config import load_config
 from sceneprior.core.classes import LABEL_SETS, class_colors, label_set, label_set_name
-from sceneprior.core.errors import InputError
+from sceneprior.core.errors import ConfigError, InputError
+from sceneprior.core.furniture import class_of_category, model_categories
+from sceneprior.core.repeatable import LARGEST_SEED, check_seed
+from sceneprior.core.scene import Scene
 from sceneprior.render.appearance import quiet_colors
 from sceneprior.render.topdown import topdown_protocol
 
@@ -25,36 +32,6 @@ def test_a_list_of_ones_own_is_its_own_name():
     assert topdown_protocol(name).window_m == 12.8
 
 
-@pytest.mark.parametrize(
-    ("name", "said"),
-    [
-        ("attic", "No label set is called 'attic'; there are front3d_bedroom, front3d_living, "
-         "scannet, front3d_dining, front3d_library, front3d_kitchen, front3d_all, or write your "
-         "own as void,bed,chair."),
-        ("void,bed,bed", "The class 'bed' is in the label set twice; list it once."),
-        ("void,", "'' is not a class name; expected 1 to 60 printable characters, without a "
-         "space at either end."),
-        ("void," + "x" * 61, "is not a class name; expected 1 to 60 printable characters"),
-    ],
-)  # fmt: skip
-def test_what_is_no_label_set(name, said):
-    with pytest.raises(InputError) as error:
-        label_set(name)
-    assert said in str(error.value)
-
-
-def test_what_is_no_list_of_names():
-    with pytest.raises(InputError, match="The class name 'bed, large' has a comma, which sep"):
-        label_set_name(["bed, large"])
-    with pytest.raises(InputError, match=r"A label set needs at least one class in addition to"):
-        label_set_name([])
-
-
-def test_colours_differ():
-    colors = class_colors(22)
-    assert len(np.unique(colors, axis=0)) == 22 and colors[0].tolist() == [128, 128, 128]
-
-
 @pytest.mark.parametrize("name", LABEL_SETS)
 def test_the_classes_of_a_label_set_differ_quietly(name):
     colors = quiet_colors(label_set(name)).astype(int)
@@ -69,3 +46,72 @@ def test_a_class_has_one_colour_in_all_label_sets_and_unknown_names_have_one_too
     piano, harp = quiet_colors(["grand piano", "harp"])
     assert (piano != harp).any() and (piano == quiet_colors(["void", "grand piano"])[1]).all()
     assert quiet_colors([]).shape[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("category", "name", "wanted"),
+    [
+        ("king-size bed", "front3d_bedroom", "double_bed"),
+        ("children cabinet", "front3d_bedroom", "children_cabinet"),
+        ("children cabinet", "front3d_living", "cabinet"),
+        ("children cabinet", "front3d_all", "children_cabinet"),
+        ("barstool", "front3d_bedroom", "void"),
+        ("barstool", "front3d_all", "stool"),
+        ("children cabinet", "scannet", "cabinet"),  # no children_cabinet there
+        ("king-size bed", "scannet", "void"),
+        ("king-size bed", "void,king-size bed,table", "king-size bed"),  # the category's own name
+        ("dining table", "void,king-size bed,table", "table"),
+        ("others", "front3d_bedroom", "void"),
+        ("flying saucer", "front3d_bedroom", "void"),
+    ],
+)
+def test_classes_of_categories(category, name, wanted):
+    assert class_of_category(category, name) == wanted
+
+
+def test_categories_are_tidied_and_damage_is_a_sentence(tmp_path):
+    with pytest.raises(InputError, match=r"No folder at .*; --models names the folder"):
+        model_categories(tmp_path / "none", "--models")
+    with pytest.raises(InputError, match=r"has no model_info\.json .* --models usually ends in"):
+        model_categories(tmp_path, "--models")
+    path = tmp_path / "model_info_revised.json"
+    rows = [
+        {"model_id": "a", "category": "Sideboard / Side Cabinet / Console Table"},
+        {"model_id": "b", "category": None},
+    ]
+    path.write_text(json.dumps(rows))
+    assert model_categories(tmp_path) == {
+        "a": "sideboard/side cabinet/console table",
+        "b": "others",
+    }
+    path.write_text(json.dumps([{"category": "Bed"}]))
+    with pytest.raises(InputError, match="is not 3D-FUTURE's list of models"):
+        model_categories(tmp_path)
+
+
+TWENTY_DIGITS = 10**20 - 1
+
+
+@pytest.fixture(scope="module", params=["sampler_run", "toy_run"])
+def prior(request):
+    return sceneprior.load(request.getfixturevalue(request.param))
+
+
+def test_a_seed_is_a_number_of_32_bits(prior):
+    check_seed(0)
+    check_seed(LARGEST_SEED)
+    assert prior.sample(1, LARGEST_SEED)[0].name == f"seed{LARGEST_SEED}_0000"
+    empty = Scene("empty", "front3d_bedroom")
+    for seed in (-1, LARGEST_SEED + 1, TWENTY_DIGITS):
+        said = rf"The seed is {seed}; expected a whole number from 0 to {LARGEST_SEED}\."
+        with pytest.raises(InputError, match=said):
+            prior.sample(1, seed)
+        with pytest.raises(InputError, match=said):
+            prior.complete(empty, 1, seed)
+    with pytest.raises(InputError, match=f"The seed is {TWENTY_DIGITS}"):
+        prior.latent(f"seed:{TWENTY_DIGITS}")
+
+
+def test_configs_take_no_larger_one():
+    with pytest.raises(ConfigError, match="seed"):
+        load_config("demo.yaml", (f"seed={TWENTY_DIGITS}",))

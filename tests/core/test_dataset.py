@@ -1,4 +1,6 @@
-"""Batches of views: padding, draws, turned rooms, and who gets which room."""
+"""Batches of views: what a data set gives, in which order, and which images it reads."""
+
+import pickle
 
 import numpy as np
 import pytest
@@ -9,9 +11,10 @@ from toy_rooms import make_toy_room, write_shard
 
 from sceneprior.core.boxes import box_corners
 from sceneprior.core.cameras import boxes_of_points
-from sceneprior.core.dataset import BLANK, ViewDataset
+from sceneprior.core.dataset import BLANK, MaskStore, ViewDataset
 from sceneprior.core.errors import ShardError
 from sceneprior.core.shards import RoomViews, Shard, list_shards
+from sceneprior.core.views import RoomBoxes
 from sceneprior.training.loader import DrawSampler, make_loader
 
 
@@ -224,3 +227,81 @@ def test_folders_that_cannot_be_used_say_so(tmp_path):
         ShardError, match="is labelled 'scannet' but its neighbours 'front3d_bedroo"
     ):
         dataset(tmp_path)
+
+
+def places(folder):
+    found = []
+    for path in list_shards(folder, "train"):
+        with Shard(path) as shard:
+            found += [(path, room_id) for room_id in shard.room_ids]
+    return found
+
+
+def test_only_views_asked_for_are_read_and_only_once(toy_shards, monkeypatch):
+    asked = []
+    read = Shard.read_instance_ids
+
+    def watched(shard, room_id, views, step):
+        asked.append((room_id, list(views)))
+        return read(shard, room_id, views, step)
+
+    monkeypatch.setattr(Shard, "read_instance_ids", watched)
+    rooms = rooms_with_images(toy_shards, "train")
+    store = MaskStore(places(toy_shards), 4)
+    for views in ([5, 2, 5], [2], [0, 5, 2]):
+        small = rooms[7].instance_ids[views, 2::4, 2::4]
+        found = store.read(7, np.array(views))
+        np.testing.assert_array_equal(found, small)
+        assert found.dtype == small.dtype
+    assert asked == [(rooms[7].room_id, [2, 5]), (rooms[7].room_id, [0])]
+    assert 0 < sum(map(len, store._packed[7].values())) < 3 * 18 * 24 / 2
+
+
+def test_few_files_stay_open_and_none_travels_to_a_worker(toy_shards, monkeypatch):
+    monkeypatch.setattr("sceneprior.core.dataset._OPEN_SHARDS", 1)
+    store = MaskStore(places(toy_shards), 4)
+    first = store.read(0, np.arange(8))
+    first_shard = next(iter(store._shards.values()))
+    store.read(11, np.arange(8))
+    assert len(store._shards) == 1 and not first_shard._file  # closed
+    again = pickle.loads(pickle.dumps(store))
+    assert not again._shards
+    np.testing.assert_array_equal(again.read(0, np.arange(8)), first)
+    np.testing.assert_array_equal(again.read(5, np.arange(8)), store.read(5, np.arange(8)))
+
+
+@pytest.fixture
+def boxes(torch_rng) -> RoomBoxes:
+    """Five rooms of 1 to 4 objects."""
+    is_object = torch.arange(4) < torch.tensor([[1], [4], [2], [3], [1]])
+    label = torch.randint(1, 9, (5, 4), generator=torch_rng) * is_object
+    return RoomBoxes(label, is_object, torch.rand(5, 4, 6, generator=torch_rng), tuple("abcde"))
+
+
+def test_batches_are_the_rooms_one_after_the_other(boxes):
+    batches = boxes.split(2)
+    assert [len(batch.is_object) for batch in batches] == [2, 2, 1]
+    for name in ("object_class", "is_object", "boxes_m"):
+        joined = torch.cat([getattr(batch, name) for batch in batches])
+        assert torch.equal(joined, getattr(boxes, name))
+    assert not any(batch.room_ids for batch in batches)
+
+
+def test_slots_are_those_that_are_asked_for(boxes, torch_rng):
+    order = torch.stack([torch.randperm(4, generator=torch_rng)[:3] for _ in range(5)])
+    taken = boxes.take(order)
+    for room in range(5):
+        for place, slot in enumerate(order[room].tolist()):
+            assert taken.object_class[room, place] == boxes.object_class[room, slot]
+            assert taken.is_object[room, place] == boxes.is_object[room, slot]
+            assert torch.equal(taken.boxes_m[room, place], boxes.boxes_m[room, slot])
+    assert taken.room_ids == boxes.room_ids
+
+
+def test_intrinsics_of_another_size_show_the_same_picture(toy_shards):
+    views = ViewDataset(toy_shards, "train", views_per_room=2).__getitems__([(0, 0), (1, 0)])
+    height, width = views.image_size
+    point_m = torch.tensor([0.3, 0.4, 1.7])
+    here = views.intrinsics @ point_m
+    there = views.intrinsics_at(height / 3, width / 4) @ point_m
+    assert_close(there / here, torch.tensor([1 / 4, 1 / 3, 1]).expand(2, 2, 3))

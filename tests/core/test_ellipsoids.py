@@ -1,7 +1,5 @@
 """2D boxes of ellipsoids: against the dual quadric, dense points, icospheres and by hand."""
 
-import math
-
 import pytest
 import torch
 from references.ellipsoids import box_of_cloud, boxes_of_quadrics
@@ -125,18 +123,6 @@ def test_gradcheck(kind, focal):
     )
 
 
-def test_only_what_asks_gets_a_gradient():
-    scene = make_scene("in front")
-    for asking in range(4):
-        scene = [
-            tensor.detach().clone().requires_grad_(i == asking) for i, tensor in enumerate(scene)
-        ]
-        boxes_of_ellipsoids(*scene, SIZE).boxes.sum().backward()
-        assert [tensor.grad is not None for tensor in scene] == [i == asking for i in range(4)]
-    with torch.no_grad():
-        assert not boxes_of_ellipsoids(*scene, SIZE).boxes.requires_grad
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("focal", [50.0, 50 * WIDE])
 def test_degenerate_ellipsoids_have_finite_boxes_and_gradients(dtype, focal):
@@ -158,39 +144,3 @@ def test_degenerate_ellipsoids_have_finite_boxes_and_gradients(dtype, focal):
     for side in range(4):
         for slope in torch.autograd.grad(boxes[..., side].sum(), scene, retain_graph=True):
             assert torch.isfinite(slope).all()
-
-
-def test_what_is_not_a_number_stays_none():
-    """So that `check_finite` stops the run, rather than a box that looks sound."""
-    for broken in range(2):
-        scene = [tensor.clone() for tensor in make_scene("in front")]
-        scene[broken][0, 0, 2] = math.nan
-        boxes = boxes_of_ellipsoids(*scene, SIZE).boxes
-        assert boxes[0, :, 0].isnan().any(dim=-1).all() and boxes[1:].isfinite().all()
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_float32_is_as_good_as_its_inputs(kind):
-    """Rounding costs no more than rounding the centres, extents and cameras does.
-
-    Measured over 4,800 boxes a kind: where all is 0.3 m ahead, at most 1.1e-6 of the image; else
-    at most 3.9 times what the box moves if every input moves by half a float32 step. Near the
-    camera's plane that is much (8e-4 at worst), whatever computes the box.
-    """
-    rounded = [tensor.float() for tensor in make_scene(kind, rooms=200, views=8, seed=8)]
-    exact = [tensor.double() for tensor in rounded]
-    found, truth = (boxes_of_ellipsoids(*scene, SIZE) for scene in (rounded, exact))
-    error = (found.boxes - truth.boxes).abs().amax(dim=-1)
-    generator = torch.Generator().manual_seed(9)
-    moved = torch.zeros_like(error)
-    for _ in range(8):
-        shaken = [
-            t * (1 + 2**-24 * torch.randn(t.shape, generator=generator, dtype=t.dtype))
-            for t in exact
-        ]
-        apart = (boxes_of_ellipsoids(*shaken, SIZE).boxes - truth.boxes).abs().amax(dim=-1)
-        moved = torch.maximum(moved, apart)
-    ahead = ranges_in_depth(*exact)[0] > 0.3
-    assert (error[ahead] < 2e-6).all()
-    assert (error <= 8 * (moved + 2**-23)).all()
-    assert (found.in_frustum == truth.in_frustum).double().mean() > 0.999

@@ -13,13 +13,6 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.files import PART, check_writable, only_writer, remove_parts, write_whole
 
 
-def test_written_in_new_folders_and_replaced(tmp_path):
-    path = tmp_path / "a" / "b" / "file.bin"
-    write_whole(path, b"one")
-    write_whole(path, b"two")
-    assert path.read_bytes() == b"two" and [p.name for p in path.parent.iterdir()] == ["file.bin"]
-
-
 def test_bytes_texts_and_functions_are_written_alike(tmp_path):
     def write(path):
         assert path.name.endswith(PART)

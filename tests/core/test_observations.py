@@ -58,13 +58,6 @@ def test_void_is_no_object_and_hides_what_is_behind_it():
     np.testing.assert_array_equal(seen.boxes[0, 0], np.float32([0, 0, 0.25, 1]))
 
 
-def test_nothing_seen_at_all():
-    seen = observe(np.zeros((3, 20, 40), np.uint16), [True, False])
-    assert seen.instance_ids.dtype == np.uint8
-    assert len(seen.tracked) == 0 and seen.boxes.shape == (3, 0, 4)
-    assert not seen.instance_ids.any()
-
-
 def test_void_after_255_objects_needs_two_bytes_and_only_where_it_is_seen():
     image = np.repeat(np.arange(1, 257, dtype=np.uint16), 5)[None, None].repeat(6, axis=1)
     classes = [True] * 255 + [False]

@@ -1,7 +1,5 @@
 """Single images out of shards."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -33,14 +31,6 @@ def test_only_what_the_view_shows_remains(room):
         assert image.object_class[k] == room.object_class[row]
         np.testing.assert_array_equal(image.boxes[k], room.boxes[view, row])
     assert image.instance_ids.max() == len(rows)
-
-
-def test_a_view_that_is_not_there_or_shows_nothing(room):
-    with pytest.raises(InputError, match=r"has no view 8; its 8 views are 0 to 7\."):
-        image_of_room(room, 8, "front3d_bedroom")
-    blank = replace(room, visible=np.zeros_like(room.visible))
-    with pytest.raises(InputError, match="View 2 of room toy/test_00 shows no object"):
-        image_of_room(blank, 2, "front3d_bedroom")
 
 
 def test_rooms_are_found_in_either_split(toy_shards):
@@ -85,18 +75,3 @@ def test_a_batch_is_one_view_a_room(toy_shards):
     for row, image in enumerate(images):
         sampled = torch.from_numpy(image.instance_ids[2::4, 2::4].astype(np.int32))
         assert torch.equal(views.instance_ids[row, 0], sampled)
-
-
-def test_void_stays_the_id_after_the_last_objects_of_an_image(room):
-    view = int(np.flatnonzero(~room.visible.all(axis=1) & room.visible.any(axis=1))[0])
-    void = room.instance_ids[view] == 0
-    ids = np.where(room.instance_ids == 0, len(room.object_class) + 1, room.instance_ids)
-    image = image_of_room(replace(room, instance_ids=ids), view, "front3d_bedroom")
-    np.testing.assert_array_equal(image.instance_ids == len(image.object_class) + 1, void)
-
-
-def test_images_of_two_sizes_are_no_batch(toy_shards):
-    images, _ = images_of_split(toy_shards, "test", 0, limit=2)
-    small = replace(images[1], instance_ids=images[1].instance_ids[::2])
-    with pytest.raises(InputError, match=r"\(36, 96\) and \(72, 96\) pixels"):
-        as_views([images[0], small], 4)

@@ -5,10 +5,10 @@ from itertools import permutations
 import numpy as np
 import pytest
 import trimesh
-from parts_of_rooms import CORNER, TABLE, boxes
+from parts_of_rooms import CORNER, TABLE
 
 from sceneprior.core.part_blends import blend_parts, matched_outlines, matched_parts
-from sceneprior.core.parts import BOX, CYLINDER, DOME, SQUARE, Parts, filled_cells, surface_of_parts
+from sceneprior.core.parts import CYLINDER, DOME, SQUARE, Parts, filled_cells, surface_of_parts
 
 ROUND = Parts(
     np.array([CYLINDER, CYLINDER, DOME]), np.zeros(3, np.int64),
@@ -71,31 +71,6 @@ def test_the_order_of_parts_makes_no_difference():
         again = matched_parts(shuffled, ROUND)[0]
         for here, same in zip(again[:3], once, strict=True):
             np.testing.assert_array_equal(here, same)
-
-
-def test_solids_of_one_kind_become_the_nearest_of_the_other():
-    """The assignment against all assignments of four legs to four others, turned and shifted."""
-    rng = np.random.default_rng(0)
-    low, other = rng.uniform(-0.5, 0.3, (2, 4, 3))
-    a, b = (
-        Parts(np.full(4, BOX), np.zeros(4, np.int64), np.stack([each, each + 0.15], axis=2))
-        for each in (low, other)
-    )
-    here, there = matched_parts(a, b)
-    found = ((here.ends - there.ends) ** 2).sum()
-    slow = min(((low[list(order)] - other) ** 2).sum() * 2 for order in permutations(range(4)))
-    assert found == pytest.approx(slow, abs=1e-5)
-
-
-def test_what_has_no_partner_is_squeezed_into_a_box_or_into_its_centre():
-    whole = boxes((0, 64, 0, 48, 0, 64))
-    here, there = matched_parts(TABLE, whole)
-    assert len(here.kind) == len(there.kind) == 5
-    inside = (there.ends >= whole.ends[..., :1]) & (there.ends <= whole.ends[..., 1:])
-    assert inside.all(), "legs are hidden in the other shape"
-    bare = Parts(*(part[:1] for part in ROUND[:3]))
-    hidden = matched_parts(whole, bare)[1].ends[matched_parts(whole, bare)[1].kind == BOX]
-    np.testing.assert_array_equal(hidden[..., 0], hidden[..., 1])
 
 
 def test_corners_of_outlines_correspond_and_outlines_keep_their_area():

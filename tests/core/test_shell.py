@@ -1,7 +1,5 @@
 """Walls on any outline: closed, outside the room, with holes, and not through furniture."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import shapely
@@ -9,9 +7,8 @@ import trimesh
 from rooms_of_solids import solid_box
 
 from sceneprior.core.boxes import yaw_rotation
-from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Opening, Scene
-from sceneprior.core.shell import THICK_M, Shell, panels, shell_meshes, shell_of
+from sceneprior.core.shell import THICK_M, Shell, panels, shell_of
 
 SQUARE = np.array([[-2.0, -1.5], [2.0, -1.5], [2.0, 1.5], [-2.0, 1.5]])
 L = np.array([[-2.5, -2], [2.5, -2], [2.5, 0.5], [0.5, 0.5], [0.5, 2.2], [-2.5, 2.2]])
@@ -57,22 +54,6 @@ def test_doors_and_windows_are_holes():
         assert solid(shell, name).is_volume
 
 
-def test_inner_faces_point_into_the_room_and_cover_its_walls():
-    shell = shell_of(room(SLANTED[::-1], openings=(WINDOW,)))
-    inner = {name: trimesh.Trimesh(*vars(m).values()) for name, m in shell.inner_meshes().items()}
-    whole = solid(shell, "floor")
-    assert inner["floor"].area == whole.area
-    assert inner["ceiling"].area == pytest.approx(shapely.Polygon(SLANTED).area)
-    np.testing.assert_allclose(inner["ceiling"].face_normals[:, 1], -1.0)
-    for row, wall in enumerate(shell.walls):
-        mesh = inner[f"wall_{row}"]
-        holes = sum((end - start) * (top - low) for start, end, low, top in wall.openings)
-        # From the lower face of the floor to the upper face of the ceiling.
-        height_m = shell.height_m + 2 * THICK_M
-        assert mesh.area == pytest.approx(wall.length_m * height_m - holes)
-        np.testing.assert_allclose(mesh.face_normals[:, ::2] @ wall.outward, -1.0, atol=1e-6)
-
-
 def test_panels_fill_the_walls_round_their_openings():
     """Panels as boxes lie in the wall's mesh, and their areas add up."""
     shell = shell_of(room(SLANTED, openings=(DOOR, WINDOW)))
@@ -89,14 +70,6 @@ def test_panels_fill_the_walls_round_their_openings():
             there = trimesh.creation.box(box.size_m, turned)
             inside = trimesh.boolean.intersection([mesh, there])
             assert inside.volume == pytest.approx(np.prod(box.size_m), rel=1e-5)
-
-
-def test_overlapping_openings_are_cut_once():
-    twice = Opening("door", (1.5, -2.0), (2.2, -2.0), 0.0, 2.1)
-    shell = shell_of(room(L, openings=(DOOR, twice)))
-    (wall,) = (wall for wall in shell.walls if wall.openings)
-    area = sum(box.size_m[0] * box.size_m[1] for box in panels(wall, shell.height_m))
-    assert area == pytest.approx(5 * 2.6 - (0.9 * 2.0 + 0.7 * 2.1 - 0.4 * 2.0))
 
 
 @pytest.mark.parametrize("outline", [SQUARE, L, SLANTED])
@@ -117,36 +90,9 @@ def test_walls_stand_clear_of_furniture(outline):
     assert wall.outward.tolist() == [1, 0] and wall.start_m[0] == pytest.approx(2.9)
 
 
-def test_furniture_across_a_corner_moves_both_walls():
-    corner = solid_box("desk", (2.0, 0.4, 1.5), (1.0, 0.8, 0.6))
-    shell = shell_of(room(SQUARE, corner))
-    np.testing.assert_allclose(shell.outline_m.max(axis=0), [2.5, 1.8])
-    np.testing.assert_allclose(shell.outline_m.min(axis=0), [-2, -1.5])
-
-
-def test_an_unknown_floor_is_a_rectangle_round_the_furniture():
-    shell = shell_of(room(None, solid_box("desk", (1, 0.4, 0), (1, 0.8, 0.6))))
-    np.testing.assert_allclose(shell.outline_m.min(axis=0), [0.3, -0.5])
-    assert shell.grown_m == 0 and len(shell.walls) == 4
-
-
 def test_the_ceiling_is_given_or_above_the_furniture():
     lamp = solid_box("ceiling_lamp", (0, 2.7, 0), (0.4, 0.2, 0.4))
     tall = solid_box("wardrobe", (0, 1.4, 0), (1, 2.8, 0.6))
     assert shell_of(room(SQUARE, lamp)).height_m == pytest.approx(2.8)
     assert shell_of(room(SQUARE, tall)).height_m == pytest.approx(2.85)
     assert shell_of(room(SQUARE, tall, ceiling_m=2.5)).height_m == 2.5
-
-
-def test_corners_that_do_not_turn_are_no_corners():
-    more = np.insert(SQUARE, 1, [[0.0, -1.5], [1.0, -1.5]], axis=0)
-    assert len(shell_of(room(more)).walls) == 4
-
-
-def test_a_part_of_the_shell_and_a_crossed_outline():
-    scene = room(SQUARE)
-    assert [*shell_meshes(scene, "none")] == []
-    assert [*shell_meshes(scene, "floor")] == ["floor"]
-    assert [*shell_meshes(scene, "walls")][-1] == "ceiling"
-    with pytest.raises(InputError, match="crosses or touches itself"):
-        shell_of(replace(scene, floor_m=SQUARE[[0, 2, 1, 3]]))

@@ -1,11 +1,94 @@
-"""Points on meshes: on the surface, even by area, and even in every part of them."""
+"""Surfaces of occupancy grids, points on surfaces, and Chamfer distances."""
+
+from collections import Counter
 
 import numpy as np
 import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from sceneprior.core.surfaces import chamfer_mean, surface_points
+from sceneprior.core.surfaces import chamfer_mean, surface_of, surface_points
+
+CENTER, SIZE = np.array([1.0, 2.0, -3.0]), np.array([2.0, 1.0, 0.5])
+
+
+def frame_points(cells=32, margin=1.1):
+    """Centres of the cells in metres from the box's centre, indexed x, y, z."""
+    axis = ((np.arange(cells) + 0.5) / cells - 0.5) * margin
+    return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1) * SIZE
+
+
+def is_closed(faces) -> bool:
+    """True if each edge is passed as often in one direction as in the other."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).tolist()
+    there, back = Counter(map(tuple, edges)), Counter((b, a) for a, b in map(tuple, edges))
+    return there == back
+
+
+def block(low, high, cells=32, margin=1.1):
+    """Logits of a block, in metres from the box's centre; they change by at most 3 a cell."""
+    points = frame_points(cells, margin)
+    depth = np.minimum(points - low, np.array(high) - points).min(axis=-1)
+    return 40 * depth
+
+
+def test_a_block_is_where_its_logits_cross_zero():
+    low, high = np.array([-0.7, -0.3, -0.2]), np.array([0.4, 0.2, 0.1])
+    vertices, faces = surface_of(block(low, high), CENTER, SIZE, 1.1)
+    # Between two centres logits of one side are linear; corners are cut off by less than a cell.
+    np.testing.assert_allclose(vertices.min(axis=0), CENTER + low, atol=1e-6)
+    np.testing.assert_allclose(vertices.max(axis=0), CENTER + high, atol=1e-6)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    assert is_closed(faces) and mesh.volume == pytest.approx(np.prod(high - low), rel=0.03)
+    assert vertices.dtype == np.float64 and faces.dtype == np.int64
+
+
+@pytest.mark.parametrize("noise", [0.0, 6.0])
+def test_surfaces_are_closed_outward_and_of_few_faces(rng, noise):
+    ball = 4 - 10 * np.linalg.norm(frame_points() / SIZE, axis=-1)
+    ball += noise * (rng.random(ball.shape) - 0.5)
+    vertices, faces = surface_of(ball.astype(np.float32), CENTER, SIZE, 1.1)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    assert len(faces) <= 2000 and is_closed(faces) and mesh.volume > 0
+    assert len(np.unique(faces)) == len(vertices)
+    if not noise:
+        assert mesh.is_watertight
+        assert mesh.volume == pytest.approx(4 / 3 * np.pi * 0.4**3 * SIZE.prod(), rel=0.01)
+
+
+def test_what_fills_the_box_s_corner_has_a_sharp_one():
+    """The lower half of the box, and a quarter of the rest."""
+    grid = np.full((22, 22, 22), -4.0)
+    grid[1:-1, 1:11, 1:-1] = 4.0
+    grid[1:11, 11:-1, 1:11] = 4.0
+    vertices, faces = surface_of(grid, CENTER, SIZE, 1.1)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    assert is_closed(faces) and mesh.volume == pytest.approx(0.625 * SIZE.prod(), rel=0.01)
+    signs = np.array([[-1, -1, -1], [1, -1, -1], [1, -1, 1], [-1, -1, 1], [-1, 1, -1]])
+    for corner in CENTER + signs * SIZE / 2:
+        assert np.abs(vertices - corner).max(axis=1).min() < 1e-6
+
+
+def test_small_pieces_are_dropped_and_large_ones_stay():
+    def with_piece(size):
+        piece = block([0.5, 0.2, 0.1], np.array([0.5, 0.2, 0.1]) + size)
+        both = np.maximum(block([-0.8, -0.4, -0.2], [0.2, 0.1, 0.05]), piece)
+        return surface_of(both, CENTER, SIZE, 1.1)[0]
+
+    assert with_piece(np.array([0.1, 0.1, 0.1]))[:, 0].max() < CENTER[0] + 0.21
+    assert with_piece(np.array([0.4, 0.25, 0.13]))[:, 0].max() > CENTER[0] + 0.85
+
+
+@pytest.mark.parametrize("logit", [-1.0, 0.0, 2.0])
+def test_nothing_and_everything_are_the_box(logit):
+    vertices, faces = surface_of(np.full((8, 8, 8), logit), CENTER, SIZE, 1.1)
+    np.testing.assert_allclose(vertices.min(axis=0), CENTER - SIZE / 2)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    assert mesh.is_watertight and mesh.volume == pytest.approx(SIZE.prod())
+    # What is occupied in the margin alone is outside the box.
+    logits = np.full((8, 8, 8), -1.0)
+    logits[0] = 1.0
+    assert len(surface_of(logits, CENTER, SIZE, 2.0)[0]) == 8
 
 
 def test_points_lie_on_the_mesh_and_go_by_their_seed():
@@ -32,17 +115,6 @@ def test_every_part_covers_the_surface_by_area(step):
     for part, middle in ((few, [0.5, 0, 0.5]), (~few, [1.5, 5, 0.5])):
         bound = 4 * 3 / np.sqrt(12 * part.sum())
         np.testing.assert_allclose(points[part].mean(axis=0), middle, atol=bound)
-
-
-def test_a_triangle_is_filled_evenly():
-    points = surface_points(
-        np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]]), np.array([[0, 1, 2]]), 20000
-    )
-    assert (points[:, :2] >= 0).all() and (points.sum(axis=1) <= 1 + 1e-12).all()
-    # Moments of a uniform point of this triangle: mean 1/3, variance 1/18, covariance -1/36.
-    np.testing.assert_allclose(points.mean(axis=0), [1 / 3, 1 / 3, 0], atol=0.006)
-    covariance = np.cov(points[:, :2].T)
-    np.testing.assert_allclose(covariance, [[1 / 18, -1 / 36], [-1 / 36, 1 / 18]], atol=0.002)
 
 
 @pytest.mark.parametrize("scale", [0.0, np.nan, np.inf])

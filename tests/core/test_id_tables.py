@@ -1,36 +1,15 @@
-"""Tables of instance ids, and what the values of masks become."""
+"""Images of instance ids, tables of their classes, and values in messages."""
+
+from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image, ImageFile
 
+from sceneprior.core.checked import shown
 from sceneprior.core.classes import STUFF
 from sceneprior.core.errors import InputError
-from sceneprior.core.id_tables import IdTable, read_class_table, stuff_of
-
-
-@pytest.mark.parametrize(
-    ("name", "text", "said"),
-    [
-        ("classes.json", "{", "classes.json cannot be read (Expecting property name"),
-        ("classes.json", "{}", "classes.json is empty; expected a class for each instance id."),
-        ("classes.json", "[[1]]", 'is not an object of ids and class names, as {"1": "bed", "2"'),
-        ("classes.json", '"bed"', "is not an object of ids and class names"),
-        ("classes.json", '{"0": "bed"}', "'0' is not an instance id; expected a number from 1 to"),
-        ("classes.json", '{"1": "bed", "1": "sofa"}', "instance id 1 is listed twice."),
-        ("classes.csv", "1,bed\n1,sofa", "instance id 1 is listed twice."),
-        ("classes.csv", "1\n", "classes.csv cannot be read (a row '1' has no class)."),
-    ],
-)  # fmt: skip
-def test_bad_tables(tmp_path, name, text, said):
-    with pytest.raises(InputError) as error:
-        (tmp_path / name).write_text(text)
-        read_class_table(tmp_path / name)
-    assert said in str(error.value)
-
-
-def test_a_missing_table_is_a_sentence(tmp_path):
-    with pytest.raises(InputError, match=r"a\.csv cannot be read \(.*No such file"):
-        read_class_table(tmp_path / "a.csv")
+from sceneprior.core.id_tables import IdTable, mask_size, read_class_table, read_mask, stuff_of
 
 
 def test_values_become_ids_in_the_tables_order():
@@ -69,13 +48,6 @@ def test_stuff_is_background_unless_the_label_set_has_its_class():
     assert not own.stuff(values).any()
 
 
-def test_a_table_without_any_class_of_the_set():
-    with pytest.raises(
-        InputError, match=r"here: none of its classes \(teapot\) is in the label set"
-    ):
-        IdTable({1: "teapot"}, "front3d_bedroom", "here")
-
-
 @pytest.mark.parametrize(
     "text",
     [
@@ -91,8 +63,57 @@ def test_tables_as_segmenters_write_them(tmp_path, text):
     assert read_class_table(tmp_path / "a.json") == {1: "bed", 7: "chair"}
 
 
-def test_rows_of_segmenters_that_name_no_class(tmp_path):
-    for text in ('[{"id": 1, "category_id": 3}]', '[{"label": "bed"}]', '[{"id": 1, "label": 3}]'):
-        (tmp_path / "a.json").write_text(text)
-        with pytest.raises(InputError, match="is not an object of ids and class names"):
-            read_class_table(tmp_path / "a.json")
+IDS = np.array([[0, 1, 2], [7, 200, 255]])
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "a.png"
+
+
+@pytest.mark.parametrize("kind", ["8 bits", "16 bits", "palette"])
+def test_the_values_are_the_ids(path, kind):
+    ids = IDS * 257 if kind == "16 bits" else IDS
+    picture = Image.fromarray(ids.astype(np.uint16 if kind == "16 bits" else np.uint8))
+    if kind == "palette":
+        picture.putpalette(list(range(255, -1, -1)) * 3)
+        assert picture.mode == "P"
+    picture.save(path)
+    read = read_mask(path)
+    np.testing.assert_array_equal(read, ids)
+    assert read.dtype == np.uint16 and mask_size(path) == (2, 3)
+
+
+def test_damage_is_a_sentence(path, rng):
+    ids = rng.integers(0, 256, (60, 80)).astype(np.uint8)
+    Image.fromarray(ids).save(path)
+    whole = path.read_bytes()
+    for end in (30, 60, len(whole) // 2, len(whole) - 30):
+        path.write_bytes(whole[:end])
+        with pytest.raises(InputError, match=r"a\.png is (damaged|not a readable PNG)"):
+            read_mask(path)
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(InputError, match="is not a readable PNG"):
+        read_mask(path)
+
+
+def test_a_png_that_is_said_to_be_too_large_for_memory(tmp_path, monkeypatch):
+    """Pillow reads as many bytes as the length of a chunk says."""
+    path = tmp_path / "a.png"
+    Image.fromarray(np.zeros((4, 4), dtype=np.uint8)).save(path)
+
+    def load(picture):
+        raise MemoryError
+
+    monkeypatch.setattr(ImageFile.ImageFile, "load", load)
+    with pytest.raises(InputError, match=r"a\.png is damaged .a part of it is said to be too"):
+        read_mask(path)
+
+
+def test_deep_and_long_values_are_shown_short():
+    deep: Any = 0
+    for _ in range(5000):
+        deep = [deep]
+    for value in (deep, {"\ud800": deep}, ["x" * 9999] * 9999, 10**9999, float("nan")):
+        assert len(shown(value)) <= 62 and shown(value).isprintable()
