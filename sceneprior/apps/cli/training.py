@@ -1,8 +1,8 @@
 """Commands that train: fit, report, and those that run many others, compare and demo."""
 
-from collections.abc import Callable, Iterator
+import pkgutil
+from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -96,13 +96,14 @@ def _stopped_by_ctrl_c() -> Iterator[None]:
         raise typer.Exit(130) from None
 
 
-def _main_of(context: typer.Context) -> Callable[[list[str]], int | None]:
-    """The command line itself, for commands that run others."""
-    return partial(context.find_root().command.main, standalone_mode=False)
+def _main(arguments: list[str]) -> int | None:
+    """The command line itself, for commands that run others; by name, since it imports this."""
+    app = pkgutil.resolve_name("sceneprior.apps.cli.commands:app")
+    status: int | None = app(arguments, standalone_mode=False)
+    return status
 
 
 def compare(
-    context: typer.Context,
     config: Annotated[
         str,
         typer.Option(help="Comparison: your YAML, or a shipped one (compare/single_view.yaml)."),
@@ -121,7 +122,7 @@ def compare(
     comparison = load_comparison(config)
     part = part_of(comparison, out, methods, rooms, seeds)
     with _stopped_by_ctrl_c():
-        done = run_comparison(comparison, part, out, _main_of(context), inception, accelerator)
+        done = run_comparison(comparison, part, out, _main, inception, accelerator)
     if done.table is not None:
         typer.echo(f"Wrote {done.table}")
     if done.left_out:
@@ -138,7 +139,6 @@ def compare(
 
 
 def demo(
-    context: typer.Context,
     out: Annotated[Path, typer.Option(help="Folder for everything the demo makes.")] = Path(
         "out/demo"
     ),
@@ -150,5 +150,5 @@ def demo(
     from sceneprior.apps.experiments.demo import run_demo
 
     with _stopped_by_ctrl_c():
-        run_demo(out, config, rooms, count, _main_of(context))
+        run_demo(out, config, rooms, count, _main)
     typer.echo(f"Open {out / 'report.html'}; scores are in {out / 'scores.json'}.")

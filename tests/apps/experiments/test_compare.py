@@ -247,7 +247,8 @@ def test_a_damaged_file_is_named(begun, tmp_path, calls):
 def test_a_stopped_comparison_says_how_to_continue(command, written, calls, tmp_path):
     calls.error = KeyboardInterrupt()
     status, _, errors = command("compare", "--config", written(), "--out", tmp_path / "out")
-    assert status == 130 and errors.endswith("Stopped. Run the same command again to continue.\n")
+    assert status == 130, errors
+    assert errors.endswith("Stopped. Run the same command again to continue.\n")
     assert calls.names == ["fit"] and not (tmp_path / "out" / "table.md").exists()
 
 
