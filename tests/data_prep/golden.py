@@ -37,9 +37,10 @@ def hold(name: str, found: dict[str, Any], slack: float = 0.0, **hidden: object)
 
 def _compare(found: Any, known: Any, slack: float, where: str) -> None:
     if isinstance(known, dict):
-        assert list(found) == list(known), where
-        found, known = list(found.values()), list(known.values())
-    if isinstance(known, list):
+        assert isinstance(found, dict) and found.keys() == known.keys(), where
+        for key, value in known.items():
+            _compare(found[key], value, slack, f"{where}.{key}")
+    elif isinstance(known, list):
         assert len(found) == len(known), where
         for one, other in zip(found, known, strict=True):
             _compare(one, other, slack, where)
