@@ -147,7 +147,7 @@ def reading(tmp_path):
     """Writes a format's toy room, and returns how it is read."""
 
     def written(name: str) -> Callable[[], None]:
-        source = FORMATS[SAME.get(name, name)](tmp_path)
+        source = FORMATS[SAME.get(name, name)](tmp_path).source
         with pool(1) as run:
             (task,) = source.survey(run).rooms
 

@@ -299,10 +299,5 @@ def write_colmap_text(folder: Path, room: PosedRoom) -> None:
     (folder / "images.txt").write_text("\n".join(lines) + "\n")
 
 
-def expected_corners(room: PosedRoom, axes: tuple[int, int, int], origin: np.ndarray) -> list:
-    """Corners of bed and chair in the room frame, from the z-up world's axes in this order."""
-    return [thing.corners[:, axes] - origin for thing in room.things[:2]]
-
-
 def classes_of(views: RoomViews, names: tuple[str, ...]) -> list[str]:
     return [names[k] for k in views.object_class]

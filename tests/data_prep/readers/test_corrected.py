@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from posed_files import prepared
 from scipy.spatial.transform import Rotation
 from untracked_room import furnished
 
@@ -132,26 +131,3 @@ def test_a_mask_of_two_objects_is_void_in_its_view(given):
     np.testing.assert_array_equal(
         found.seen.instance_ids[others], before.instance_ids[others].astype(np.uint8)
     )
-
-
-def test_prepared_rooms_have_corrected_poses(tmp_path):
-    """A capture with wrong poses; the room's cameras are as of the capture with right ones."""
-    room = furnished(tmp_path / "room")
-    room.size, room.focal_px = (240, 320), 160.0
-    keys = {"floor_m": 0.0, "floor_center_m": (0.0, 0.0)}
-    classes = "void,bed,chair,cabinet,nightstand,lamp"
-    right = prepared(room.write(**keys), classes)
-    assert not any("corrected" in note for note in right.notes)
-    flip = np.diag([1.0, -1, -1, 1])
-    given = room_cameras(np.stack(room.poses) @ flip, np.eye(4))
-    given = moved_cameras(given, errors(len(given)))
-    room.poses = [np.linalg.inv(pose) @ flip for pose in given]
-    room.write_transforms(room.data | keys)  # the masks are those of before
-    made = prepared(room, classes)
-    assert any(note.startswith("poses are corrected by 0.") for note in made.notes)
-    turn = np.array(made.cameras["room_from_world"])
-    wrong = room_cameras(np.stack(room.poses) @ flip, turn)
-    true = right.views.world_to_camera.astype(float)
-    off = [np.median(apart_deg(each, true)) for each in (wrong, made.views.world_to_camera)]
-    assert off[0] > 0.4 and off[1] < 0.4 * off[0]
-    np.testing.assert_array_equal(made.views.instance_ids, right.views.instance_ids)

@@ -12,7 +12,6 @@ from data_prep.readers.frames import (
     sampled_lines,
 )
 from data_prep.readers.scannet import FULL_SIZE, QUARTER_SIZE
-from sceneprior.core.errors import InputError
 
 
 def still(count):
@@ -123,13 +122,6 @@ def test_masks_of_another_size_show_the_same_picture():
         assert (np.abs([u, v]).max(axis=1) <= 0.75 / step).all()
         if image_size == (480, 640):
             assert np.abs([u, v]).max() < 1e-10
-
-
-def test_masks_of_another_shape_are_refused():
-    with pytest.raises(
-        InputError, match="masks are 484 x 484 pixels but the colour frames 1296 x 968"
-    ):
-        mask_intrinsics(K, FULL_SIZE, (484, 484), QUARTER_SIZE)
 
 
 def test_lines_are_sampled_as_shards_sample_them():

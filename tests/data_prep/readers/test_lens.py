@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from data_prep.readers.posed.lens import Lens, straighten
-from sceneprior.core.errors import InputError
 
 K = np.array([[80.0, 0, 63], [0, 82, 49], [0, 0, 1]])
 SIZE = (96, 128)
@@ -78,8 +77,3 @@ def test_of_a_lens_that_sees_more_than_half_the_world_the_middle_is_kept():
     assert view.cut_share > 0.5
     half = np.degrees(np.arctan(view.intrinsics[0, 2] / view.intrinsics[0, 0]))
     assert 50 < half <= 65.1
-
-
-def test_a_lens_that_folds_the_picture_over_is_refused():
-    with pytest.raises(InputError, match=r"its lens \(OPENCV -0.9, 0, 0, 0, 0\) distorts so much"):
-        straighten(Lens((-0.9, 0.0, 0.0, 0.0, 0.0)), K, SIZE)

@@ -420,7 +420,7 @@ CASES = [(name, damage) for name, damages in OTHERS.items() for damage in damage
 def test_damaged_files_are_refused_in_one_sentence(tmp_path, name, damage):
     folder = tmp_path / "data"
     folder.mkdir()
-    source = FORMATS[name](folder)
+    source = FORMATS[name](folder).source
     with pool(1) as run:
         (task,) = source.survey(run).rooms
     OTHERS[name][damage](folder)
@@ -574,7 +574,7 @@ def test_label_tables_that_are_foreign(tmp_path, name):
                                   "scannetpp, colmap", "scannetpp, iphone"])  # fmt: skip
 def test_every_file_of_a_data_set_may_be_damaged(tmp_path, name, damage, numbers):
     """One sentence that names the file, or a room; never another error."""
-    source = FORMATS[name](tmp_path)
+    source = FORMATS[name](tmp_path).source
     with pool(1) as run:
         (task,) = source.survey(run).rooms
     named = 0

@@ -5,7 +5,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 from untracked_room import frames, furnished
 
-from data_prep.readers import tangents
 from data_prep.readers.tangents import find_outlines, hull_corners, measure_gaps
 from sceneprior.core.observations import observe
 
@@ -111,12 +110,3 @@ def test_slopes_are_derivatives(given):
             # larger the gap, the more.
             allowed = 1e-3 + 3 * np.abs(gaps.gaps_px[gaps.valid])
             assert (off < allowed).mean() > 0.98
-
-
-def test_the_number_of_pairs_is_bounded(given, monkeypatch):
-    seen, _, intrinsics = given
-    whole = find_outlines(seen, intrinsics).pairs
-    monkeypatch.setattr(tangents, "PAIRS_AT_MOST", 50)
-    thinned = find_outlines(seen, intrinsics).pairs
-    assert 25 < len(thinned) <= 50 and {*map(tuple, thinned)} < {*map(tuple, whole)}
-    assert tangents.PAIRS_AT_MOST == 50 < len(whole)
