@@ -56,15 +56,13 @@ class Hypersim(Reader):
 
     def rooms(self, scene: str) -> dict[str, FoundRoom]:
         """The scene as one room."""
-        row = _camera_row(self.folder / CAMERAS, scene)
-        return {scene: FoundRoom(_image_size(row))}
+        return {scene: FoundRoom(_camera(self.folder / CAMERAS, scene)[0])}
 
     def read(self, task: RoomTask) -> FramedRoom:
         """See `Reader.read`."""
         scene = self.folder / task.house
-        row = _camera_row(self.folder / CAMERAS, task.house)
-        size = _image_size(row)
-        intrinsics, tilt = pinhole(_cam_from_uv(row), size)
+        size, cam_from_uv = _camera(self.folder / CAMERAS, task.house)
+        intrinsics, tilt = pinhole(cam_from_uv, size)
         unit = _metres_per_unit(scene / "_detail" / "metadata_scene.csv")
         images, poses = _trajectories(scene, unit)
         with_ids = [k for k, paths in enumerate(images) if all(path.is_file() for path in paths)]
@@ -106,11 +104,19 @@ def _camera_rows(path: Path) -> dict[str, dict[str, str]]:
     return {row["scene_name"]: row for row in rows}
 
 
-def _camera_row(path: Path, scene: str) -> dict[str, str]:
+def _camera(path: Path, scene: str) -> tuple[tuple[int, int], np.ndarray]:
+    """(height, width) of a scene's images, and the projection of its cameras (`pinhole`)."""
     rows = _camera_rows(path)
     if scene not in rows:
         raise InputError(f"{path} has no row for {plain(scene)}.")
-    return rows[scene]
+    where = f"{CAMERAS}, {scene}"
+    names = ["settings_output_img_height", "settings_output_img_width"]
+    height, width = _numbers(rows[scene], names, where)
+    names = [f"M_cam_from_uv_{i}{j}" for i in range(3) for j in range(3)]
+    matrix = _numbers(rows[scene], names, where).reshape(3, 3)
+    if not np.linalg.det(matrix) < -1e-6:  # a camera looks along -z
+        raise InputError(f"{where}: M_cam_from_uv is no projection; it is damaged.")
+    return (int(height), int(width)), matrix
 
 
 def _numbers(row: dict[str, str], names: list[str], where: str) -> np.ndarray:
@@ -121,21 +127,6 @@ def _numbers(row: dict[str, str], names: list[str], where: str) -> np.ndarray:
     if not np.isfinite(values).all():
         raise InputError(f"{where} has no numbers in {names[0]} to {names[-1]}; it is damaged.")
     return values
-
-
-def _image_size(row: dict[str, str]) -> tuple[int, int]:
-    names = ["settings_output_img_height", "settings_output_img_width"]
-    height, width = _numbers(row, names, f"{CAMERAS}, {row['scene_name']}")
-    return int(height), int(width)
-
-
-def _cam_from_uv(row: dict[str, str]) -> np.ndarray:
-    names = [f"M_cam_from_uv_{i}{j}" for i in range(3) for j in range(3)]
-    where = f"{CAMERAS}, {row['scene_name']}"
-    matrix = _numbers(row, names, where).reshape(3, 3)
-    if not np.linalg.det(matrix) < -1e-6:  # a camera looks along -z
-        raise InputError(f"{where}: M_cam_from_uv is no projection; it is damaged.")
-    return matrix
 
 
 def _metres_per_unit(path: Path) -> float:

@@ -6,6 +6,7 @@
 <scan>_2d-instance-filt.zip or <scan>_2d-instance.zip     masks of the objects
 """
 
+import contextlib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,11 +19,10 @@ from data_prep.engine.plan import digest, seeded_split
 from data_prep.engine.source import Line, RoomTask
 from data_prep.readers.frames import Y_UP, chosen_frames, mask_intrinsics, sampled_lines
 from data_prep.readers.labels import LABEL_SET, Labels, read_labels
-from data_prep.readers.mask_zip import MASK_FILES, MaskArchive
 from data_prep.readers.reader import FoundRoom, Reader
 from data_prep.readers.rooms import FramedRoom, ScannedObjects
+from data_prep.readers.scan_files import MASK_FILES, MaskArchive, read_alignment, read_sens
 from data_prep.readers.scanned_mesh import AnnotatedMesh, read_annotated_mesh
-from data_prep.readers.sens import axis_alignment, read_properties, read_sens
 from sceneprior.core.checked import plain, shown
 from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.errors import InputError
@@ -112,27 +112,27 @@ class ScanNet(Reader):
         with a class, because ScanNet has no floor plans, and its annotated floors cover only the
         parts that the camera saw.
         """
-        files = _Files(self.folder / task.house)
-        properties = read_properties(files.path(".txt"))
-        is_aligned = "axisAlignment" in properties
-        world_from_scan = Y_UP @ axis_alignment(files.path(".txt"), properties)
+        folder, name = self.folder / task.house, task.house
+        alignment = read_alignment(folder / f"{name}.txt")
+        is_aligned = alignment is not None
+        world_from_scan = Y_UP if alignment is None else Y_UP @ alignment
         scan = read_annotated_mesh(
-            files.path("_vh_clean_2.ply"),
-            files.path("_vh_clean_2.0.010000.segs.json"),
-            files.path(".aggregation.json"),
+            folder / f"{name}_vh_clean_2.ply",
+            folder / f"{name}_vh_clean_2.0.010000.segs.json",
+            folder / f"{name}.aggregation.json",
             world_from_scan,
         )
         notes = [*scan.notes]
         if not is_aligned:
             notes.append(
-                f"{files.path('.txt').name} has no axisAlignment, which ScanNet v2's file has: the "
+                f"{name}.txt has no axisAlignment, which ScanNet v2's file has: the "
                 "direction of the walls is found from masks"
             )
         labels = read_labels(self.labels)
         objects = _objects(scan, labels, notes)
-        poses, intrinsics, ids, stuff = self._views(files, objects, notes)
-        names = label_set(LABEL_SET)
-        kinds = [names.index(item.label) for item in objects]
+        poses, intrinsics, ids, stuff = self._views(folder, objects, notes)
+        classes = label_set(LABEL_SET)
+        kinds = [classes.index(item.label) for item in objects]
         return FramedRoom(
             where=task.room_id,
             ids=ids,
@@ -155,12 +155,12 @@ class ScanNet(Reader):
         )
 
     def _views(
-        self, files: "_Files", objects: list["_Object"], notes: list[str]
+        self, folder: Path, objects: list["_Object"], notes: list[str]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Poses, intrinsics (3, 3), images of ids and of stuff, of the frames that become views."""
-        mask_path, sens_path = files.masks(self.masks), files.path(".sens")
+        mask_path, sens_path = _mask_path(folder, self.masks), folder / f"{folder.name}.sens"
         sens = read_sens(sens_path)
-        with MaskArchive(mask_path) as masks:
+        with contextlib.closing(MaskArchive(mask_path)) as masks:
             choice = chosen_frames(
                 str(sens_path), sens.camera_to_world, masks.frames, self.max_views,
                 self.frame_step, f"mask in {mask_path.name}",
@@ -211,27 +211,19 @@ class ScanNet(Reader):
         return np.stack(images), np.stack(stuff)
 
 
-class _Files(NamedTuple):
-    """The files of a scan, whose names begin with the scan's."""
-
-    folder: Path
-
-    def path(self, ending: str) -> Path:
-        return self.folder / f"{self.folder.name}{ending}"
-
-    def masks(self, kind: str) -> Path:
-        path = self.path(MASK_FILES[kind])
-        if path.is_file():
-            return path
-        others = [
-            f" (or give --masks {other}, whose archive is here)"
-            for other, ending in MASK_FILES.items()
-            if other != kind and self.path(ending).is_file()
-        ]
-        raise InputError(
-            f"{path} is missing: the instance masks. Download it into the scan's folder"
-            f"{''.join(others)}."
-        )
+def _mask_path(scan: Path, kind: str) -> Path:
+    paths = {name: scan / f"{scan.name}{ending}" for name, ending in MASK_FILES.items()}
+    if paths[kind].is_file():
+        return paths[kind]
+    others = [
+        f" (or give --masks {name}, whose archive is here)"
+        for name, path in paths.items()
+        if path.is_file()
+    ]
+    raise InputError(
+        f"{paths[kind]} is missing: the instance masks. Download it into the scan's folder"
+        f"{''.join(others)}."
+    )
 
 
 class _Object(NamedTuple):

@@ -1,5 +1,6 @@
 """Masks as one PNG per frame: grey ids with a table of classes, or COCO's panoptic colours."""
 
+from abc import abstractmethod
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -39,7 +40,22 @@ def find_table(folder: Path) -> Path:
     return found[0]
 
 
-class IdPngs(MaskFormat):
+class FramePngs(MaskFormat):
+    """One PNG per frame: `PosedFrame.instances`."""
+
+    def wanted(self, frame: PosedFrame) -> str:
+        return str(frame.instances)
+
+    def of(self, frame: PosedFrame) -> FrameMask | None:
+        path = frame.instances
+        return self.of_png(path) if path.is_file() else None
+
+    @abstractmethod
+    def of_png(self, path: Path) -> FrameMask:
+        """The masks in a PNG."""
+
+
+class IdPngs(FramePngs):
     """PNGs whose values are ids. The classes are in the room's table or, for ids of single frames,
     in a JSON beside each PNG with the same stem, in any form of `read_class_table`."""
 
@@ -57,16 +73,10 @@ class IdPngs(MaskFormat):
         beside = (self.folder / INSTANCES).rglob("*.json")
         return any((self.folder / name).is_file() for name in TABLES) or not any(beside)
 
-    def of(self, frame: PosedFrame) -> FrameMask | None:
-        path = frame.instances
-        if not path.is_file():
-            return None
+    def of_png(self, path: Path) -> FrameMask:
         return FrameMask(
             partial(mask_size, path), partial(read_mask, path), partial(self._classes_of, path)
         )
-
-    def wanted(self, frame: PosedFrame) -> str:
-        return str(frame.instances)
 
     @cached_property
     def _table(self) -> dict[int, str]:
@@ -114,7 +124,7 @@ class _Panoptic(_Strict):
     annotations: list[_Annotation]
 
 
-class PanopticPngs(MaskFormat):
+class PanopticPngs(FramePngs):
     """COCO's panoptic format: PNGs whose colours encode segment ids, and one JSON for all PNGs.
 
     Video segmenters give an object the same id in all frames; the ids of COCO's own single images
@@ -129,18 +139,12 @@ class PanopticPngs(MaskFormat):
         table = folder / PANOPTIC
         return [table, *sorted((folder / INSTANCES).rglob("*.png"))] if table.is_file() else []
 
-    def of(self, frame: PosedFrame) -> FrameMask | None:
-        path = frame.instances
-        if not path.is_file():
-            return None
+    def of_png(self, path: Path) -> FrameMask:
         return FrameMask(
             partial(mask_size, path, rgb=True),
             lambda: self._segments.read(path),
             lambda: self._segments.of_frame.get(path.stem, {}),
         )
-
-    def wanted(self, frame: PosedFrame) -> str:
-        return str(frame.instances)
 
     @cached_property
     def _segments(self) -> "_Segments":

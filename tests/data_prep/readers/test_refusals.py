@@ -23,11 +23,10 @@ from data_prep.engine.plan import read_splits
 from data_prep.engine.source import Line, RoomTask
 from data_prep.engine.workers import pool
 from data_prep.readers import DATA_SETS, open_reader
-from data_prep.readers.mask_zip import MaskArchive
 from data_prep.readers.posed.formats import read_formats, read_label_set
 from data_prep.readers.posed.reader import Posed, find_rooms
+from data_prep.readers.scan_files import MaskArchive, read_sens
 from data_prep.readers.scannet import ScanNet, find_scans, split_scans
-from data_prep.readers.sens import read_sens
 from sceneprior.core.errors import InputError
 
 Damage = Callable[[Path], object]

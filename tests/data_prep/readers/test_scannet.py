@@ -5,6 +5,7 @@ import json
 import shutil
 import tracemalloc
 import zlib
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -35,8 +36,8 @@ from data_prep.engine.workers import pool
 from data_prep.inspection.agreement import box_iou_2d, boxes_around, hull_of, true_bodies
 from data_prep.inspection.verify import agreement_of, verify
 from data_prep.readers.labels import read_labels
-from data_prep.readers.mask_zip import MaskArchive
 from data_prep.readers.rooms import prepare_room
+from data_prep.readers.scan_files import MaskArchive, read_alignment, read_sens
 from data_prep.readers.scanned_mesh import (
     Group,
     focal_and_center,
@@ -45,7 +46,6 @@ from data_prep.readers.scanned_mesh import (
     unoccluded,
 )
 from data_prep.readers.scannet import FULL_SIZE, QUARTER_SIZE, ScanNet, find_scans, split_scans
-from data_prep.readers.sens import axis_alignment, read_properties, read_sens
 from sceneprior.core.classes import STUFF, label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.shard_writing import room_checksum
@@ -141,7 +141,7 @@ def test_masks_are_read_in_place(tmp_path):
         "readme.txt": b"",
     }
     path = write_zip(tmp_path / "a.zip", members)
-    with MaskArchive(path) as archive:
+    with closing(MaskArchive(path)) as archive:
         assert archive.frames == (0, 15, 30) and archive.image_size == (12, 16)
         for seed, frame in ((2, 30), (0, 0), (1, 15)):
             values = archive.read(frame)
@@ -171,7 +171,7 @@ def test_members_that_are_no_readable_picture(tmp_path):
     for name, data in cases.items():
         with (
             refused(f"readers/member | {name}", tmp=tmp_path),
-            MaskArchive(write_zip(tmp_path / "a.zip", {"0.png": data})) as archive,
+            closing(MaskArchive(write_zip(tmp_path / "a.zip", {"0.png": data}))) as archive,
         ):
             archive.read(0)
     data = bytearray(write_zip(tmp_path / "a.zip", {"0.png": png(mask())}).read_bytes())
@@ -184,10 +184,15 @@ def test_members_that_are_no_readable_picture(tmp_path):
 
 def test_properties_alignment_and_groups(tmp_path):
     path = tmp_path / "a.txt"
-    path.write_text("axisAlignment = 1 0 \nsceneType = Bedroom / Hotel\n\nno pair\n")
-    assert read_properties(path) == {"axisAlignment": "1 0", "sceneType": "Bedroom / Hotel"}
-    matrix = axis_alignment(path, {"axisAlignment": "0 -1 0 2 1 0 0 3 0 0 1 4 0 0 0 1"})
-    assert matrix.tolist() == [[0, -1, 0, 2], [1, 0, 0, 3], [0, 0, 1, 4], [0, 0, 0, 1]]
+    path.write_text("sceneType = Bedroom / Hotel\n\nno pair\n")
+    assert read_alignment(path) is None
+    path.write_text("axisAlignment = 0 -1 0 2 1 0 0 3 0 0 1 4 0 0 0 1 \nsceneType = Bedroom\n")
+    assert read_alignment(path).tolist() == [
+        [0, -1, 0, 2],
+        [1, 0, 0, 3],
+        [0, 0, 1, 4],
+        [0, 0, 0, 1],
+    ]
     rows = [(5, "bed", [1]), (2, "chair", [2]), (5, "sofa", [7])]
     groups = [{"objectId": k, "label": name, "segments": parts} for k, name, parts in rows]
     path.write_text(json.dumps({"segGroups": groups}))
