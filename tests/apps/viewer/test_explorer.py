@@ -1,20 +1,22 @@
-"""What a page can ask for, without a page: the same rooms as the commands make."""
+"""Rooms that a page can show, without a page: the same as the commands make, and their map."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 from tiny_runs import tiny_baseline
 
 import sceneprior
 from sceneprior.apps.api import Prior
 from sceneprior.apps.viewer.explorer import PATH_STEPS, Explorer, Folder, Shown, floor_side_m
+from sceneprior.apps.viewer.latent_map import SNAP, make_map
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.paper.decode import decode_training_rooms
+from sceneprior.paper.latents import LatentCube, LatentSphere
 from sceneprior.paper.sampling import LATENTS_FILE, write_latents
-from sceneprior.training.method import TrainedSampler
 
 
 @pytest.fixture(scope="module")
@@ -42,19 +44,14 @@ def test_a_seed_makes_the_room_that_synthesize_makes(explorer, prior):
     assert same(explorer.sample(4).scene, prior.sample(1, 4)[0])
 
 
-def test_a_click_on_a_dot_is_that_training_room(explorer, prior):
+def test_a_click_on_a_dot_is_that_training_room_and_a_drag_keeps_the_rest(explorer, prior):
     rooms = decode_training_rooms(prior.trained)
     start = explorer.sample(0)
-    for row in (0, 5):
-        dot = tuple(explorer.map.rooms[row].tolist())
-        found = explorer.map.room_at(dot)  # of dots that touch, the nearest
-        shown = explorer.at(start, dot, click=True)
-        assert shown.scene.name == rooms[found].name and same(shown.scene, rooms[found])
-        assert not same(explorer.at(start, dot).scene, shown.scene)  # dragged over: the rest stays
-
-
-def test_a_drag_keeps_what_the_map_does_not_show(explorer):
-    start = explorer.sample(0)
+    dot = tuple(explorer.map.rooms[5].tolist())
+    found = explorer.map.room_at(dot)  # of dots that touch, the nearest
+    shown = explorer.at(start, dot, click=True)
+    assert shown.scene.name == rooms[found].name and same(shown.scene, rooms[found])
+    assert not same(explorer.at(start, dot).scene, shown.scene)  # dragged over: the rest stays
     shown = start
     for point in ((0.1, 0.1), (0.2, -0.1), (-0.3, 0.0)):
         shown = explorer.at(shown, point)
@@ -66,27 +63,22 @@ def test_a_drag_keeps_what_the_map_does_not_show(explorer):
     assert explorer.at(without, (-0.3, 0.0)).scene.latent is not None
 
 
-def test_a_path_leads_from_the_room_on_show_to_a_seed(explorer, prior):
+def test_a_path_leads_from_the_room_on_show_to_a_seed(explorer, prior, tmp_path):
     start = explorer.sample(3)
-    z = explorer.draw_path(start, "here", " seed:9 ")
-    assert len(z) == PATH_STEPS
+    assert len(explorer.draw_path(start, "here", " seed:9 ")) == PATH_STEPS
     assert same(explorer.step(0).scene, start.scene)
     assert same(explorer.step(PATH_STEPS - 1).scene, prior.sample(1, 9)[0])
     assert explorer.step(3).origin == f"path, step 3 of {PATH_STEPS - 1}"
-    with pytest.raises(InputError, match=r"'nowhere' is neither a training room .* nor here"):
-        explorer.draw_path(start, "here", "nowhere")
     drawn = replace(start, scene=replace(start.scene, latent=None))
     with pytest.raises(InputError, match="has no latent"):
         explorer.draw_path(drawn, "here", "seed:9")
-
-
-def test_a_path_s_end_is_no_file_of_this_machine(explorer, prior, tmp_path):
+    # Files of latents may be named on the command line, never in the browser.
     write_latents(tmp_path, prior.sample(2, 3))
     file = tmp_path / LATENTS_FILE
-    assert prior.latent(f"{file}:1").shape == (prior.trained.config.model.width,)  # for commands
-    for text in (str(file), f"{file}:1", f" {file}:seed3_0001"):
-        with pytest.raises(InputError, match="is neither a training room"):
-            explorer.draw_path(explorer.sample(3), "here", text)
+    assert prior.latent(f"{file}:1").shape == (prior.trained.config.model.width,)
+    for text in ("nowhere", str(file), f"{file}:1", f" {file}:seed3_0001"):
+        with refused("viewer/end_of_a_path", text=text.strip()):
+            explorer.draw_path(start, "here", text)
 
 
 def test_completion_keeps_what_is_kept():
@@ -106,22 +98,16 @@ def test_the_nearest_training_room(explorer, prior):
     assert same(shown.scene, next(room for room in rooms if room.name == shown.scene.name))
 
 
-def test_without_latents_of_rooms_there_are_new_rooms_and_no_map(prior):
+def test_without_latents_there_are_new_rooms_and_no_map(prior, toy_shards):
     bare = replace(prior.trained, logits=prior.trained.logits[:0], room_ids=())
     explorer = Explorer(Prior(bare, "bare"))
     assert explorer.map is None and explorer.has_latents
     assert explorer.without_map.startswith("The map needs the latents of training rooms, and this ")
     assert explorer.distributions == ("paper",)
     assert explorer.sample(0).origin == "seed 0, from: paper" and explorer.layouts()
-
-
-def test_a_method_without_a_latent_space_samples(toy_shards):
-    config = tiny_baseline(toy_shards, "atiss")
-    torch.manual_seed(0)
+    config = tiny_baseline(toy_shards, "atiss")  # a method without a latent space
     networks = config.networks(config.stage_names[-1], 3)
-    trained = config.trained(networks, config.stage_names[-1], ())
-    assert isinstance(trained, TrainedSampler)
-    explorer = Explorer(Prior(trained, "other"))
+    explorer = Explorer(Prior(config.trained(networks, config.stage_names[-1], ()), "other"))
     assert explorer.map is None and not explorer.has_latents and explorer.distributions == ()
     assert "which has no latent space" in explorer.without_map
     assert explorer.sample(0).origin == "seed 0, from: atiss"
@@ -131,8 +117,47 @@ def test_a_folder_s_rooms():
     bed = SceneObject("double_bed", (1.0, 0.5, -2.0), (2.0, 1.0, 2.0))
     scenes = [Scene(name, "front3d_bedroom", (bed,)) for name in ("a", "b")]
     assert Folder(scenes).room(1) == Shown(scenes[1], "b, 2 of 2")
-    assert Folder(scenes).label_set == "front3d_bedroom"
     # It reaches 3 m from the origin.
     assert floor_side_m(scenes) == 6 and floor_side_m([Scene("c", "front3d_bedroom")]) == 4
-    with pytest.raises(InputError, match="label sets front3d_bedroom, front3d_living were given"):
-        _ = Folder([*scenes, Scene("c", "front3d_living")]).label_set
+
+
+# -- The map ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def z(torch_rng):
+    return LatentSphere(20, 8)(torch.randn(30, 20, generator=torch_rng) * 2)
+
+
+def test_axes_are_the_principal_components(z):
+    latent_map = make_map(LatentSphere(20, 8), z)
+    values, vectors = np.linalg.eigh(np.cov(z.double().numpy().T))
+    ours = latent_map.axes.double().numpy()
+    np.testing.assert_allclose(np.abs(ours @ vectors[:, :-3:-1]), np.eye(2), atol=1e-4)
+    assert latent_map.share == pytest.approx(values[-2:].sum() / values.sum(), rel=1e-4)
+    # Whatever sign a singular vector comes with, the map is the same way up.
+    again = make_map(LatentSphere(20, 8), z.flip(0))
+    torch.testing.assert_close(again.axes, latent_map.axes, rtol=0, atol=1e-4)
+    x, y = latent_map.rooms[7].tolist()
+    assert latent_map.room_at((x, y)) == 7
+    beyond = latent_map.rooms.amax(dim=0) + 1.01 * SNAP * latent_map.side
+    assert latent_map.room_at(tuple(beyond.tolist())) is None
+    with refused("viewer/map_of_two_rooms"):
+        make_map(LatentSphere(20, 8), z[:2])
+
+
+def test_moving_goes_where_the_pointer_is_and_keeps_the_rest(z, torch_rng):
+    latent_map = make_map(LatentSphere(20, 8), z)
+    moved = latent_map.moved(z[3], (0.3, -0.4))
+    assert moved.norm().item() == pytest.approx(1, abs=1e-6)
+    np.testing.assert_allclose(latent_map.place(moved[None])[0], [0.3, -0.4], atol=1e-6)
+    # No other point of the sphere at this place is nearer to where it began.
+    assert moved @ z[3] > latent_map.moved(z[4], (0.3, -0.4)) @ z[3]
+    back = latent_map.moved(moved, tuple(latent_map.rooms[3].tolist()))
+    torch.testing.assert_close(back, z[3], rtol=0, atol=1e-5)
+    cube = LatentCube(6)  # whose walls hold
+    inside = cube(torch.randn(20, 6, generator=torch_rng))
+    latent_map = make_map(cube, inside)
+    near = latent_map.moved(inside[1] * 0.2, (0.1, 0.05))
+    np.testing.assert_allclose(latent_map.place(near[None])[0], [0.1, 0.05], atol=1e-6)
+    assert latent_map.moved(inside[1], (9.0, 9.0)).abs().max() <= cube.half_edge + 1e-6
