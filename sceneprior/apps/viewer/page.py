@@ -81,8 +81,6 @@ class Page:
         self._direction = CORNER if self.board is None else FRONT
         self._bounds_m = np.zeros((2, 3))
         """Lowest and highest corner of the room when it was framed."""
-        self._eyes: dict[int, np.ndarray] = {}
-        """Last position that was set for each browser's camera."""
         server.scene.set_up_direction("+y")
         server.initial_camera.fov = FOV_RAD
         self.show(self.shown)
@@ -136,10 +134,10 @@ class Page:
         forward = SO3(np.asarray(camera.wxyz)).as_matrix()[:, 2]
         if turned or abs(forward[1]) > 0.99:
             forward = self._direction
-        eye, target = framed(self._points(), forward, camera.fov, camera.aspect)
-        self._eyes[client.client_id] = eye
         with client.atomic():
-            camera.position, camera.look_at = eye, target
+            camera.position, camera.look_at = framed(
+                self._points(), forward, camera.fov, camera.aspect
+            )
 
     def _connected(self, client: "viser.ClientHandle") -> None:
         """Frame the room in a new browser's window, and again when the window changes its shape."""
@@ -147,9 +145,8 @@ class Page:
 
         def update(camera: Any) -> None:
             nonlocal aspect
-            own = self._eyes.get(client.client_id)
-            reshaped, aspect = abs(camera.aspect - aspect) > 0.01, camera.aspect
-            if own is None or (reshaped and np.allclose(camera.position, own, atol=0.02)):
+            if abs(camera.aspect - aspect) > 0.01:
+                aspect = camera.aspect
                 self._place(client, turned=True)
 
         update(client.camera)

@@ -61,7 +61,7 @@ def opened(browser, source, title: str, **more) -> Iterator[Panel]:
         browser.get_log("browser")
         browser.get(f"http://127.0.0.1:{server.get_port()}")
         wait_for(lambda: "Whole room in view" in words(browser), "no panel came")
-        wait_for(lambda: panel.page._eyes, "the room was not framed")
+        wait_for(server.get_clients, "the browser did not connect")
         # viser warns that WebGL is drawn in software, right over the board.
         close = "document.querySelectorAll('.mantine-Notification-closeButton')"
         browser.execute_script(f"{close}.forEach(x => x.click())")
