@@ -31,7 +31,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from sceneprior.apps.config import load_config
 from sceneprior.core.cameras import MIN_DEPTH_M, Boxes2D, project
-from sceneprior.core.meshes import icosphere, place
+from sceneprior.core.proxies import icosphere, place
 from sceneprior.core.views import DecodedScenes, SceneViews
 from sceneprior.paper.config import PaperConfig
 from sceneprior.paper.prior import ScenePrior

@@ -28,7 +28,7 @@ from harness import children_cpu_s, machine, medians, report
 
 from sceneprior.core.cameras import Pinhole, look_at
 from sceneprior.core.errors import InputError
-from sceneprior.core.meshes import icosphere
+from sceneprior.core.proxies import icosphere
 from sceneprior.core.scene import Mesh
 from sceneprior.render.offscreen import open_renderer
 

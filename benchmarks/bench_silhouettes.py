@@ -23,7 +23,7 @@ import torch
 from harness import machine, medians, report
 
 from sceneprior.core.cameras import look_at
-from sceneprior.core.meshes import icosphere
+from sceneprior.core.proxies import icosphere
 from sceneprior.render.silhouettes import render_scene
 
 SIZE = (90, 120)

@@ -25,8 +25,8 @@ from trimesh.voxel.morphology import fill_orthographic
 
 from sceneprior.apps.config import load_run
 from sceneprior.apps.experiments.evaluate import decoded_and_true
-from sceneprior.core.meshes import icosphere
-from sceneprior.core.overlaps import match_scenes
+from sceneprior.core.boxes import match_scenes
+from sceneprior.core.proxies import icosphere
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.core.surfaces import chamfer_of, nearest_distances, surface_of
 from sceneprior.evaluation.metrics.contents import reconstruction_scores

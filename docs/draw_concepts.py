@@ -32,7 +32,7 @@ from sceneprior.apps.viewer.latent_map import make_map
 from sceneprior.core.cameras import project
 from sceneprior.core.classes import class_colors, label_set
 from sceneprior.core.dataset import FlatViews
-from sceneprior.core.meshes import icosphere, place
+from sceneprior.core.proxies import icosphere, place
 from sceneprior.core.shards import RoomViews, Shard, thinned
 from sceneprior.core.views import SceneViews
 from sceneprior.paper.decode import decode_latents

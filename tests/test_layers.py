@@ -41,9 +41,9 @@ MAY_TOO = {
 
 BUDGET = {
     "data_prep": (13743, 110),
-    "sceneprior/core": (5757, 34),
+    "sceneprior/core": (5745, 32),
     "sceneprior/furniture": (586, 4),
-    "sceneprior/render": (4596, 36),
+    "sceneprior/render": (4552, 27),
     "sceneprior/training": (929, 9),
     "sceneprior/paper": (2710, 24),
     "sceneprior/lifted": (8880, 68),
@@ -61,7 +61,7 @@ OWNERS = {
     "OpenGL": ["sceneprior/render/offscreen/"],
     "numba": [
         "sceneprior/render/silhouettes/", "sceneprior/render/offscreen/zbuffer.py",
-        "sceneprior/render/offscreen/sky.py", "sceneprior/lifted/lifting/", "data_prep/tracks/",
+        "sceneprior/lifted/lifting/", "data_prep/tracks/",
     ],
     "triton": ["sceneprior/render/silhouettes/"],
     "lightning": [
@@ -85,7 +85,7 @@ OWNERS = {
     "fast_simplification": ["sceneprior/core/surfaces.py"],
     "sklearn": ["sceneprior/evaluation/", "sceneprior/lifted/sampler/stage"],
     "scipy.optimize": [
-        "sceneprior/core/overlaps.py", "sceneprior/core/part_blends.py",
+        "sceneprior/core/boxes.py", "sceneprior/core/part_blends.py",
         "sceneprior/paper/matching.py",
         "sceneprior/evaluation/", "data_prep/inspection/causes.py",
     ],

@@ -6,18 +6,18 @@ Functions take numpy arrays and torch tensors alike, except for the two that tra
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
-
-from sceneprior.core.boxes import Array
 
 if TYPE_CHECKING:
     from torch import Tensor
 else:
     Tensor = Any  # shapes are checked all the same
 
+Array = TypeVar("Array", bound=Any)
+"""A numpy array or a torch tensor; data preparation does not need torch."""
 MIN_DEPTH_M = 1e-3
 """Minimum depth. Points at or behind the camera are moved to this depth before the division, as in
 the authors' code."""

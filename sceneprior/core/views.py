@@ -90,7 +90,7 @@ class DecodedScenes:
     completeness_logits: Float[Tensor, "rooms objects"]
     """Completeness before the sigmoid; see `kept_objects` in `paper/losses.py`."""
     bevels: Float[Tensor, "rooms objects 2"] | None = None
-    """Bevels of the proxy `beveled_box` (`beveled_cube` in `core/meshes.py`); None for
+    """Bevels of the proxy `beveled_box` (`beveled_cube` in `core/proxies.py`); None for
     rooms that were not decoded by a prior."""
     vertices_m: Float[Tensor, "rooms objects vertices 3"] | None = None
     """Mesh vertices in the room frame; None before the shape decoder has run, and for

@@ -22,12 +22,12 @@ from sceneprior.core.scene import Mesh, Scene
 from sceneprior.core.shell import ShellName, shell_of
 from sceneprior.core.surfaces import decimate
 from sceneprior.render.appearance import quiet_colors
-from sceneprior.render.floor_plans import plan_of
 from sceneprior.render.pictures import png_bytes
 from sceneprior.render.scene_files import scene_to_glb
 from sceneprior.render.topdown import (
     corner_view,
     perspective,
+    plan_of,
     shows_walls,
     topdown_protocol,
     view_of,

@@ -12,10 +12,10 @@ from typing import Any, TypeVar
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from sceneprior.core.boxes import match_scenes
 from sceneprior.core.classes import label_set
 from sceneprior.core.files import write_whole
 from sceneprior.core.ground_truth import known_in_3d, reference_scenes
-from sceneprior.core.overlaps import match_scenes
 from sceneprior.core.scene import Scene
 from sceneprior.core.shards import Shard, iterate_rooms, list_shards
 from sceneprior.evaluation.page import (

@@ -10,8 +10,8 @@ import shapely
 import trimesh
 from jaxtyping import Float
 
+from sceneprior.core.boxes import box_iou_3d
 from sceneprior.core.errors import InputError
-from sceneprior.core.overlaps import box_iou_3d
 from sceneprior.core.scene import Mesh, SceneObject
 from sceneprior.core.surfaces import chamfer_of, nearest_distances
 from sceneprior.evaluation.metric import COVERAGE, ratio, resample_counts

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
-from sceneprior.core.overlaps import match_scenes, shared_of_smaller
+from sceneprior.core.boxes import match_scenes, shared_of_smaller
 from sceneprior.core.scene import Scene, SceneObject
 
 BADLY = 0.25

@@ -9,7 +9,7 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from sceneprior.core.meshes import icosphere, place, to_cube
+from sceneprior.core.proxies import icosphere, place, to_cube
 from sceneprior.core.scene import Mesh
 from sceneprior.core.views import DecodedScenes
 from sceneprior.paper.layers import ShapeModule, ShapeModuleConfig

@@ -7,8 +7,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from sceneprior.core.cameras import Boxes2D, boxes_of_points
-from sceneprior.core.ellipsoids import boxes_of_ellipsoids
-from sceneprior.core.meshes import beveled_cube, place
+from sceneprior.core.proxies import beveled_cube, boxes_of_ellipsoids, place
 from sceneprior.core.views import DecodedScenes, SceneViews
 from sceneprior.paper.losses import layout_losses
 from sceneprior.paper.matching import Matches, match_objects

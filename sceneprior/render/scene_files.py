@@ -25,10 +25,10 @@ from sceneprior.render.appearance import (
     scene_meshes,
     shell_color,
 )
-from sceneprior.render.floor_plans import floor_plan
 from sceneprior.render.model_files import joined, load_parts
 from sceneprior.render.pictures import png_bytes
 from sceneprior.render.scene_simulators import scene_to_usd
+from sceneprior.render.topdown import floor_plan
 
 NO_SHELL: Mapping[str, Mesh] = {}
 PACKAGE_FORMATS = "sceneprior-"

@@ -28,7 +28,7 @@ from sceneprior.baselines.gan.stage import GanStage
 from sceneprior.core.cameras import camera_centers
 from sceneprior.core.classes import VOID
 from sceneprior.core.dataset import ViewDataset
-from sceneprior.core.meshes import place
+from sceneprior.core.proxies import place
 from sceneprior.core.shards import iterate_rooms
 from sceneprior.core.views import DecodedScenes
 from sceneprior.paper.losses import kept_objects

@@ -17,7 +17,7 @@ from sceneprior.core.boxes import (
     turn_vectors,
     yaw_rotation,
 )
-from sceneprior.core.meshes import beveled_cube, icosphere, place, to_cube
+from sceneprior.core.proxies import beveled_cube, icosphere, place, to_cube
 
 
 def test_box_corners_are_center_plus_minus_half_a_size():

@@ -6,7 +6,7 @@ from references.ellipsoids import box_of_cloud, boxes_of_quadrics
 from torch.testing import assert_close
 
 from sceneprior.core.cameras import MIN_DEPTH_M
-from sceneprior.core.ellipsoids import boxes_of_ellipsoids
+from sceneprior.core.proxies import boxes_of_ellipsoids
 
 SIZE = (60, 80)
 WIDE = 1e-5

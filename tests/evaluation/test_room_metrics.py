@@ -9,8 +9,8 @@ import pytest
 from scipy.stats import wasserstein_distance
 from toy_metrics import compared_with, of_classes, room, room_set
 
+from sceneprior.core.boxes import box_iou_3d, match_scenes
 from sceneprior.core.classes import label_set
-from sceneprior.core.overlaps import box_iou_3d, match_scenes
 from sceneprior.core.scene import Scene
 from sceneprior.evaluation.metric import Comparison
 from sceneprior.evaluation.metrics import METRICS

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from sceneprior.core.meshes import icosphere, to_cube
+from sceneprior.core.proxies import icosphere, to_cube
 from sceneprior.paper.config import PaperModel
 from sceneprior.paper.latents import SphereConfig
 from sceneprior.paper.prior import ScenePrior

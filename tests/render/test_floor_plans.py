@@ -6,7 +6,7 @@ import pytest
 from sceneprior.core.classes import label_set
 from sceneprior.core.scene import Opening, Scene, SceneObject
 from sceneprior.render.appearance import FLOOR_COLOR, quiet_colors
-from sceneprior.render.floor_plans import DOOR, LEGEND_PX, PLAN_PX, WALL, WINDOW, floor_plan
+from sceneprior.render.topdown import DOOR, LEGEND_PX, PLAN_PX, WALL, WINDOW, floor_plan
 
 BEDROOM = "front3d_bedroom"
 COLORS = dict(zip(label_set(BEDROOM), quiet_colors(label_set(BEDROOM)).tolist(), strict=True))

@@ -25,7 +25,6 @@ from sceneprior.core.scene import (
 )
 from sceneprior.core.scene_json import scene_to_json
 from sceneprior.render.appearance import quiet_colors
-from sceneprior.render.floor_plans import floor_plan
 from sceneprior.render.scene_files import (
     load_scene,
     load_scene_folder,
@@ -33,7 +32,7 @@ from sceneprior.render.scene_files import (
     save,
     scene_to_glb,
 )
-from sceneprior.render.topdown import topdown
+from sceneprior.render.topdown import floor_plan, topdown
 
 
 @pytest.fixture

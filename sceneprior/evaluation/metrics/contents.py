@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
+from sceneprior.core.boxes import SceneMatch, match_scenes
 from sceneprior.core.classes import LABEL_SETS, VOID, label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.overlaps import SceneMatch, match_scenes
 from sceneprior.core.scene import Scene
 from sceneprior.evaluation.metric import (
     AGAINST_TEST,

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
+from sceneprior.core.boxes import intersection_volumes
 from sceneprior.core.classes import label_set
-from sceneprior.core.overlaps import intersection_volumes
 from sceneprior.core.scene import Scene
 from sceneprior.evaluation.metric import (
     AGAINST_TEST,

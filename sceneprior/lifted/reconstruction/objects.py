@@ -13,12 +13,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from sceneprior.core.boxes import QUARTERS, turn_vectors
+from sceneprior.core.boxes import QUARTERS, box_iou_3d, turn_vectors
 from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.meshes import beveled_cube, icosphere
 from sceneprior.core.observed_image import ObservedImage
-from sceneprior.core.overlaps import box_iou_3d
+from sceneprior.core.proxies import beveled_cube, icosphere
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.views import DecodedScenes
 from sceneprior.lifted.prototype_decoder import PrototypeDecoder

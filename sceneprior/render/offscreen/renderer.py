@@ -12,7 +12,7 @@ import numpy as np
 
 from sceneprior.core.cameras import Camera, Pinhole, to_camera
 from sceneprior.core.scene import Mesh
-from sceneprior.render.offscreen.sky import sky_light
+from sceneprior.render.offscreen.zbuffer import sky_light
 
 EVEN = 0.2
 """Exponent that brightens walls and evens out their brightness: 0.4 becomes 0.83."""

@@ -6,8 +6,7 @@ import pytest
 from sceneprior.core.cameras import Pinhole, look_at
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.render.appearance import box_mesh
-from sceneprior.render.offscreen.sky import DARKEST, sky_light
-from sceneprior.render.offscreen.zbuffer import rasterize
+from sceneprior.render.offscreen.zbuffer import DARKEST, rasterize, sky_light
 from sceneprior.render.topdown import perspective
 
 SIZE = (60, 80)

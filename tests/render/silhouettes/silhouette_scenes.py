@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from toy_rooms import look_at
 
-from sceneprior.core.meshes import icosphere
+from sceneprior.core.proxies import icosphere
 from sceneprior.render.silhouettes.render import render_scene
 
 MODES = ("exact", "fast")

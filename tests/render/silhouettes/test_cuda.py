@@ -18,7 +18,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from sceneprior.core.meshes import icosphere
+from sceneprior.core.proxies import icosphere
 from sceneprior.render.silhouettes import reference
 from sceneprior.render.silhouettes.render import render_scene
 

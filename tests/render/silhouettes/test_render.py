@@ -11,7 +11,7 @@ from silhouette_scenes import MODES, SIZE, cast, random_scene, sphere_scene
 from torch.testing import assert_close
 from toy_rooms import look_at
 
-from sceneprior.core.meshes import icosphere
+from sceneprior.core.proxies import icosphere
 from sceneprior.render.offscreen.zbuffer import rasterize
 from sceneprior.render.silhouettes.render import render_scene, render_silhouettes, sigma_from_ndc
 

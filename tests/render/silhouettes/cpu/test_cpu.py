@@ -18,7 +18,7 @@ from silhouette_scenes import (
 from torch.testing import assert_close
 
 from sceneprior.core.cameras import project
-from sceneprior.core.meshes import icosphere
+from sceneprior.core.proxies import icosphere
 from sceneprior.render.silhouettes.cpu.kernels import in_threads, windows_of
 from sceneprior.render.silhouettes.reference import Settings
 from sceneprior.render.silhouettes.render import NEAR_FACE_M, render_scene, render_silhouettes

@@ -13,7 +13,7 @@ from silhouette_scenes import seen_ahead, triangles
 from torch import Tensor
 
 from sceneprior.core.cameras import project
-from sceneprior.core.meshes import icosphere
+from sceneprior.core.proxies import icosphere
 from sceneprior.render.silhouettes.reference import PIECE_PX
 from sceneprior.render.silhouettes.render import render_silhouettes
 
