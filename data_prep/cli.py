@@ -16,9 +16,8 @@ if TYPE_CHECKING:
 
 def add_commands(app: typer.Typer) -> None:
     """Mount the prep-* commands, inspect and make-homes."""
-    for command in (
-        make_homes, prep_front, recipe, prep_scannet, prep_posed, prep_dataset, inspect
-    ):  # fmt: skip
+    prep = (prep_front, recipe, prep_scannet, prep_posed, prep_dataset)
+    for command in (make_homes, *prep, inspect):
         app.command()(command)
 
 
@@ -150,8 +149,7 @@ def prep_scannet(
 
 def prep_posed(
     rooms: Annotated[
-        Path,
-        typer.Argument(help="A room's folder (its poses and masks), or a folder of such."),
+        Path, typer.Argument(help="A room's folder (its poses and masks), or a folder of such.")
     ],
     out: Out,
     label_set: Annotated[

@@ -4,9 +4,8 @@ import contextlib
 import multiprocessing
 import os
 import signal
-import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import wait
@@ -41,12 +40,8 @@ def pool(workers: int) -> Iterator[Run]:
     def in_order(
         function: Callable[..., Any], arguments: list[Any], title: str | None
     ) -> Iterator[Any]:
-        with progress(title, len(arguments)) as advance:
-            futures = [submit(function, *item) for item in arguments]
-            for future in futures:
-                future.add_done_callback(lambda _: advance())
-            for future in futures:
-                yield future.result()
+        for future in _tracked([submit(function, *item) for item in arguments], title):
+            yield future.result()
 
     try:
         yield in_order
@@ -67,11 +62,18 @@ def pool(workers: int) -> Iterator[Run]:
 def _in_process(
     function: Callable[..., Any], arguments: list[Any], title: str | None
 ) -> Iterator[Any]:
-    with progress(title, len(arguments)) as advance:
-        for item in arguments:
-            result = function(*item)
-            advance()
-            yield result
+    for item in _tracked(arguments, title):
+        yield function(*item)
+
+
+def _tracked(items: list[Any], title: str | None) -> Iterable[Any]:
+    """The items, with a progress bar on stderr if there is a title."""
+    if title is None or not items:
+        return items
+    from rich.console import Console
+    from rich.progress import track
+
+    return track(items, title, console=Console(stderr=True))
 
 
 def _start_worker() -> None:
@@ -84,20 +86,3 @@ def _start_worker() -> None:
         os._exit(1)
 
     threading.Thread(target=end_with_parent, daemon=True).start()
-
-
-@contextlib.contextmanager
-def progress(title: str | None, total: int) -> Iterator[Callable[[], None]]:
-    """Show a progress bar on stderr if there is a title; yields the function that advances it."""
-    if title is None or not total:
-        yield lambda: None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
-
-    with Progress(
-        "{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
-        console=Console(file=sys.stderr),
-    ) as progress:  # fmt: skip
-        task = progress.add_task(title, total=total)
-        yield lambda: progress.advance(task)

@@ -207,7 +207,14 @@ def surface(
     depth: Float[np.ndarray, "views height width"],
 ) -> Surface:
     """Find the cells at the depths of `first_hits`, and the ids that all views show there."""
-    hit = _cells_at(depth, cameras.eyes_m, cameras.rays, *grid)
+    view, row, column = np.nonzero(np.isfinite(depth))
+    pixels = np.stack([column + 0.5, row + 0.5, np.ones(len(view))], axis=1)
+    directions = (cameras.rays[view] @ pixels[..., None])[..., 0]
+    points = cameras.eyes_m[view] + depth[view, row, column, None] * directions
+    at = ((points - grid.low_m) / grid.cell_m).astype(np.int64)
+    at = at[((at >= 0) & (at < grid.filled.shape)).all(axis=1)]  # depths are rounded to float32
+    hit = np.zeros_like(grid.filled)
+    hit[tuple(at.T)] = True
     cells = np.argwhere(hit & grid.filled)
     return Surface(cells, ids_at(cells, ids, cameras, grid, depth))
 
@@ -293,20 +300,6 @@ def _first_hits(ids, eyes_m, rays, low_m, cell_m, filled):
                 break
             t += stride
     return depth
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _cells_at(depth, eyes_m, rays, low_m, cell_m, filled):
-    hit = np.zeros_like(filled)
-    for view, row, column in np.ndindex(depth.shape):
-        t = depth[view, row, column]
-        if t < 1e9:
-            direction = direction_of(rays[view], row, column)
-            cell = cell_at(eyes_m[view], direction, t, low_m, cell_m, filled.shape)
-            if cell[0] >= 0:
-                hit[cell] = True
-    return hit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
