@@ -23,9 +23,10 @@ def hold(name: str, found: dict[str, Any], slack: float = 0.0, **hidden: object)
     """
     path = FOLDER / f"{name}.json"
     known = json.loads(path.read_text()) if path.exists() else {}
-    found = json.loads(json.dumps(found))
+    text = json.dumps(found, sort_keys=True)
     for word, value in hidden.items():
-        found = json.loads(json.dumps(found).replace(str(value), f"<{word}>"))
+        text = text.replace(str(value), f"<{word}>")
+    found = json.loads(text)
     if os.environ.get("TAKE_GOLDENS"):
         known |= found
         path.parent.mkdir(parents=True, exist_ok=True)
