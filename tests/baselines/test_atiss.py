@@ -13,7 +13,6 @@ from sceneprior.baselines.atiss import (
     END,
     HALF_STEP,
     LEVELS,
-    PARTS,
     Atiss,
     AtissModel,
     LogisticMixture,
@@ -118,21 +117,6 @@ def test_padding_and_neighbours_in_the_batch_mean_nothing(network, objects):
     assert_close(network.context(*objects)[1:], alone, rtol=0, atol=1e-12)
     nothing = network.context(object_class[:, :0], unit[:, :0], is_object[:, :0])
     assert_close(nothing[0], nothing[1], rtol=0, atol=0)
-
-
-def test_each_part_hears_of_the_class_and_of_the_parts_before_it(network, objects):
-    context, beds = network.context(*objects), torch.tensor([2, 2])
-    unit = torch.zeros(2, 7, dtype=torch.float64)
-    known = network.log_prob(context, beds, unit)
-    other_class = network.log_prob(context, torch.tensor([3, 3]), unit)
-    assert all((other_class[name] != known[name]).all() for name in PARTS)
-    for number, hears in ((0, ("angle", "size")), (3, ("size",)), (4, ())):
-        moved = unit.clone()
-        moved[:, number] = 0.3
-        told = network.log_prob(context, beds, moved)
-        own = next(name for name, (start, end) in PARTS.items() if start <= number < end)
-        for name in PARTS:
-            assert (told[name] != known[name]).all() == (name in (*hears, own))
 
 
 def test_metres_and_back(network, objects):

@@ -13,20 +13,8 @@ from sceneprior.evaluation.synthesis import EvalOptions
 from sceneprior.training.checkpoints import read_checkpoint
 from sceneprior.training.fit import fit
 
-LOGGED = {
-    "atiss2d": {"mask"},
-    "gan": {"discriminator", "objects", "real_score", "fake_score"},
-    "atiss": {"class", "position", "angle", "size"},
-    "sync2gen": {"existence", "position", "size", "kl", "left_out"},
-    "set_flow": {"class", "position", "angle", "size"},
-    "usl": {"box", "frustum", "mask"},
-    "total3d": {"offset", "size", "bin", "residual", "corners", "chamfer", "edges"},
-    "im3d": {"offset", "size", "bin", "residual", "corners", "refined", "refined_corners",
-             "shape", "overlap"},
-}  # fmt: skip
-"""Curves of the last stage of each baseline, beside its loss."""
-STAGES = {name: (name,) for name in LOGGED} | {"atiss2d": ("layout", "shape")}
-WITHOUT_LATENTS = ("gan", "atiss", "sync2gen", "set_flow")
+METHODS = ("atiss2d", "gan", "atiss", "sync2gen", "set_flow", "usl", "total3d", "im3d")
+STAGES = {name: (name,) for name in METHODS} | {"atiss2d": ("layout", "shape")}
 
 
 @pytest.fixture(autouse=True)
@@ -34,7 +22,7 @@ def no_classifier(monkeypatch: pytest.MonkeyPatch) -> None:
     without_classifiers(monkeypatch)
 
 
-@pytest.mark.parametrize("method", LOGGED)
+@pytest.mark.parametrize("method", METHODS)
 def test_an_interrupted_and_resumed_run_reaches_the_same_weights(
     baseline_config, baseline_run, method, tmp_path
 ):
@@ -52,28 +40,6 @@ def test_an_interrupted_and_resumed_run_reaches_the_same_weights(
     for one, other in zip(wanted["optimizer_states"], reached["optimizer_states"], strict=True):
         for key, moments in one["state"].items():
             assert torch.equal(moments["exp_avg_sq"], other["state"][key]["exp_avg_sq"])
-
-
-@pytest.mark.parametrize("method", ("atiss2d", *WITHOUT_LATENTS))
-def test_new_rooms_depend_on_the_seed_alone(baseline_run, method):
-    trained = load_any_run(baseline_run(method))
-    assert trained.remembers_rooms == (method == "atiss2d")
-    rooms = [sample_rooms(load_any_run(baseline_run(method)), 9, seed) for seed in (2, 2, 3)]
-    boxes = [
-        [[(item.label, item.center_m, item.size_m) for item in room.objects] for room in rooms_]
-        for rooms_ in rooms
-    ]
-    assert boxes[0] == boxes[1] != boxes[2]
-    assert [room.name for room in rooms[0][:2]] == ["seed2_0000", "seed2_0001"]
-    objects = [item for room in rooms[0] for item in room.objects]
-    makes_meshes = method in ("atiss2d", "gan")
-    assert objects and all((item.mesh is not None) == makes_meshes for item in objects)
-    assert all(min(item.size_m) > 0 for item in objects)
-    yaws = [room.extra.get("yaw_rad") for room in rooms[0]]
-    if method in ("atiss", "set_flow"):
-        assert [len(yaw) for yaw in yaws] == [len(room.objects) for room in rooms[0]]
-    else:
-        assert not any(yaws)
 
 
 @pytest.mark.parametrize("method", ("gan", "atiss"))

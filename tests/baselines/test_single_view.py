@@ -3,7 +3,6 @@
 import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from tiny_runs import tiny_baseline
@@ -22,8 +21,8 @@ from sceneprior.baselines.single_view.total3d import (
     estimate_losses,
     true_objects,
 )
-from sceneprior.baselines.single_view.truth import TrueViewDataset, filled
-from sceneprior.baselines.single_view.usl import other_view_losses, silhouette_loss
+from sceneprior.baselines.single_view.truth import TrueViewDataset
+from sceneprior.baselines.single_view.usl import silhouette_loss
 from sceneprior.core.boxes import turn_vectors
 from sceneprior.core.dataset import ViewDataset
 from sceneprior.core.observed_image import images_of_split
@@ -91,12 +90,6 @@ def test_offsets_and_distances_are_where_centers_are(views):
     assert not ahead.any() and not offsets.any()
 
 
-def test_a_view_without_a_mask_is_no_detection(views):
-    blank = replace(some_views(views, slice(1)), visible=torch.zeros_like(views.visible[:, :1]))
-    found = detections_of(blank)
-    assert len(found) == 0 and found.padded(found.boxes).shape == (0, 0, 4)
-
-
 METHODS = ("total3d", "im3d")
 
 
@@ -157,15 +150,6 @@ def test_masks_hear_of_their_own_image_alone(batch, stage):
     assert less[0][0].center_m == pytest.approx(together[0][0].center_m, abs=1e-4)
 
 
-def test_what_a_surface_encloses_is_filled_and_what_it_does_not_is_empty():
-    top = np.random.default_rng(0).uniform(-1, 1, (20000, 3)) * (1, 0.1, 1) + (0, 0.9, 0)
-    legs = np.random.default_rng(1).uniform(-1, 1, (20000, 3)) * (0.1, 1, 0.1)
-    corners = np.array([[x, 0, z] for x in (-0.9, 0.9) for z in (-0.9, 0.9)])
-    table = filled(np.concatenate([top, *(legs + corner for corner in corners)]), 16)
-    assert table[:, -1].all() and table[0, :, 0].all()
-    assert not table[2:-2, :13, :].any() and not table[:, :13, 2:-2].any()
-
-
 def test_occupancy_is_the_definition(torch_rng):
     blobs = torch.randn(2, 5, 7, generator=torch_rng, dtype=torch.float64) * 0.5
     points = torch.rand(2, 9, 3, generator=torch_rng, dtype=torch.float64) * 2 - 1
@@ -197,20 +181,6 @@ def test_what_stands_behind_another_object_costs_nothing(views):
     assert float(silhouette_loss(perfect + everywhere_else, views, seen)) < 1e-5
     background = (ids == 0).unsqueeze(2).float().expand_as(perfect)
     assert float(silhouette_loss(perfect + background, views, seen)) > 0.3
-
-
-def test_an_object_that_no_other_view_shows_teaches_nothing(views, usl):
-    found, others = detections_of(some_views(views, slice(1))), some_views(views, slice(1, None))
-    faces = usl.prior.shape.faces
-    hidden = replace(others, visible=others.visible & (torch.arange(others.visible.shape[2]) != 0))
-    losses = other_view_losses(found, *usl.prior(found), faces, hidden, usl.settings)
-    sum(losses.values()).backward()
-    before = [p.grad.clone() for p in usl.prior.parameters()]
-    assert all(torch.isfinite(slope).all() for slope in before)
-    nobody = replace(others, visible=torch.zeros_like(others.visible))
-    usl.zero_grad()
-    losses = other_view_losses(found, *usl.prior(found), faces, nobody, usl.settings)
-    assert {name: loss.item() for name, loss in losses.items()} == dict.fromkeys(losses, 0.0)
 
 
 METHODS = ("usl", "total3d", "im3d")

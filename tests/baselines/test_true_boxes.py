@@ -9,7 +9,6 @@ import torch
 
 import sceneprior
 from sceneprior.baselines.true_boxes import TruthDataset
-from sceneprior.core.boxes import box_corners
 from sceneprior.core.dataset import BLANK, ViewDataset
 from sceneprior.core.shards import iterate_rooms
 
@@ -42,40 +41,6 @@ def test_rows_are_those_of_the_views(toy_shards):
     for rotations in (1, 4):
         views = ViewDataset(toy_shards, "train", 4, rotations=rotations)
         assert TruthDataset(toy_shards, "train", rotations).room_ids == views.room_ids
-
-
-def test_a_turned_room_is_the_room_seen_by_turned_cameras(toy_shards):
-    """Camera and box turn together: in the camera's frame the same corners, in another order."""
-    boxes = TruthDataset(toy_shards, "train", 4).__getitems__(UNMIRRORED)
-    views = ViewDataset(toy_shards, "train", 1, rotations=4).__getitems__(
-        [(row, 0) for row in range(8, 12)]
-    )
-    # The views of a room's four copies are drawn each by itself: turn the plain copy's by hand.
-    plain = views.world_to_camera[0, 0]
-    quarter = torch.tensor([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
-    seen = []
-    for turn in range(4):
-        camera = plain @ torch.linalg.matrix_power(quarter, turn).T
-        corners = box_corners(boxes.boxes_m[turn, :, :3], boxes.boxes_m[turn, :, 3:])
-        points = corners @ camera[:3, :3].T + camera[:3, 3]
-        seen.append(np.sort(points.numpy().round(4), axis=1))
-    for other in seen[1:]:
-        np.testing.assert_allclose(other, seen[0], atol=2e-4)
-
-
-def test_fronts_turn_with_their_pieces(toy_shards, torch_rng):
-    dataset = TruthDataset(toy_shards, "train", 4)
-    dataset._yaw_rad = (torch.rand(dataset._yaw_rad.shape, generator=torch_rng) - 0.5) * 2 * np.pi
-    boxes = dataset.__getitems__(UNMIRRORED)
-    quarter = torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
-    fronts = torch.stack(
-        [boxes.yaw_rad.sin(), torch.zeros_like(boxes.yaw_rad), boxes.yaw_rad.cos()], dim=-1
-    )
-    there = boxes.is_object[0]
-    assert len(boxes.yaw_rad[0, there].unique()) > 1 and boxes.yaw_rad.abs().max() <= np.pi + 1e-6
-    for turn in range(4):
-        wanted = fronts[0] @ torch.linalg.matrix_power(quarter, turn).T
-        np.testing.assert_allclose(fronts[turn, there], wanted[there], atol=1e-6)
 
 
 def test_two_epochs_show_a_room_in_its_eight_symmetries(toy_shards, torch_rng):
