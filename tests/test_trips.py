@@ -15,7 +15,7 @@ import pytest
 from tiny_runs import tiny_config
 
 import sceneprior
-from sceneprior.training.loader import make_loader
+from sceneprior.training.steps import make_loader
 
 ROOT = Path(__file__).parents[1]
 OURS = (f"{ROOT}/sceneprior/", f"{ROOT}/data_prep/")

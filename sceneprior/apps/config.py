@@ -14,8 +14,7 @@ from sceneprior.core.errors import ConfigError, InputError
 from sceneprior.core.settings import check_settings, read_settings, shortened
 from sceneprior.paper.prior import TrainedPrior
 from sceneprior.training.checkpoints import find_checkpoint
-from sceneprior.training.method import RunConfig, Trained, TrainedReconstructor
-from sceneprior.training.settings import without_samples
+from sceneprior.training.method import RunConfig, Trained, TrainedReconstructor, without_samples
 
 METHODS = {
     "paper": "sceneprior.paper.config:PaperConfig",

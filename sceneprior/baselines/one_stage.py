@@ -13,8 +13,7 @@ from torch import Tensor, nn
 
 from sceneprior.core.settings import Section
 from sceneprior.core.views import RoomBoxes, SceneViews
-from sceneprior.training.method import RunConfig, Stage
-from sceneprior.training.settings import TrainConfig
+from sceneprior.training.method import RunConfig, Stage, TrainConfig
 from sceneprior.training.steps import check_finite, log_losses, with_cosine
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 from torch import nn
 
 from sceneprior.core.dataset import ViewDataset
+from sceneprior.paper.decoders import ShapeDecoderConfig
 from sceneprior.paper.prior import ModelConfig, PriorConfig
 from sceneprior.paper.settings import (
     LayoutConfig,
@@ -15,10 +16,8 @@ from sceneprior.paper.settings import (
     ShapeConfig,
     StageConfig,
 )
-from sceneprior.paper.shape_decoder import ShapeDecoderConfig
 from sceneprior.paper.transformer import TransformerConfig
-from sceneprior.training.method import Stage
-from sceneprior.training.settings import ViewDataConfig
+from sceneprior.training.method import Stage, ViewDataConfig
 
 if TYPE_CHECKING:
     from sceneprior.paper.stages import LatentStage

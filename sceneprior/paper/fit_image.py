@@ -98,10 +98,7 @@ def view_loss(
     """
     weights, drawing = trained.config.view_terms
     boxes = seen_boxes(scenes, views, drawing)
-    target = trained.config.model.completeness_target
-    losses, matches = match_and_score(scenes, boxes, views, weights, target, True)
-    # A single image does not show how many objects the room holds in all (supplement D).
-    del losses["completeness"]
+    losses, matches = match_and_score(scenes, boxes, views, weights, None)
     total = weighted_sum(losses, weights)
     faces = trained.prior.faces
     if not masks or scenes.vertices_m is None or faces is None or drawing is None:

@@ -121,28 +121,19 @@ def mixed_colors(room: DecodedRoom) -> UInt8[np.ndarray, "objects 3"]:
     return np.rint(mixed / share.sum(axis=-1, keepdims=True)).astype(np.uint8)
 
 
-def strip(
-    pictures: Sequence[UInt8[np.ndarray, "height width 3"]],
-) -> UInt8[np.ndarray, "strip_height strip_width 3"]:
-    """Pictures side by side, in rows of nine."""
-    return contact_sheet(pictures, min(STRIP_COLUMNS, len(pictures)))
-
-
-def animation(pictures: Sequence[UInt8[np.ndarray, "height width 3"]]) -> bytes:
-    """A GIF that plays the pictures forwards and backwards in an endless loop."""
-    times = [FRAME_MS] * len(pictures)
-    times[0] = times[-1] = PAUSE_MS
-    there_and_back = [*pictures, *pictures[-2:0:-1]]
-    return gif_bytes(there_and_back, times + times[-2:0:-1])
-
-
 def write_pictures(trained: TrainedPrior, scenes: Sequence[Scene], folder: Path) -> None:
     """Write `strip.png`, which shows `scenes` (the rooms of `interpolate`), and `animation.gif`,
-    which has `BETWEEN` pictures per step."""
+    which has `BETWEEN` pictures per step and plays forwards and backwards in an endless loop."""
     start, end = (latent_of(trained, scene) for scene in (scenes[0], scenes[-1]))
     places = even_places((len(scenes) - 1) * BETWEEN + 1)
     rooms = RoomPath(trained, start, end).rooms(places, [""] * len(places))
     view = corner_view([room.scene for room in rooms], TILE)
     pictures = [perspective(room.scene, view=view, colors=mixed_colors(room)) for room in rooms]
-    write_whole(folder / "strip.png", png_bytes(strip(pictures[::BETWEEN])))
-    write_whole(folder / "animation.gif", animation(pictures))
+    stills = pictures[::BETWEEN]
+    sheet = contact_sheet(stills, min(STRIP_COLUMNS, len(stills)))
+    write_whole(folder / "strip.png", png_bytes(sheet))
+    times = [FRAME_MS] * len(pictures)
+    times[0] = times[-1] = PAUSE_MS
+    there_and_back = [*pictures, *pictures[-2:0:-1]]
+    gif = gif_bytes(there_and_back, times + times[-2:0:-1])
+    write_whole(folder / "animation.gif", gif)

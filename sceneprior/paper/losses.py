@@ -35,28 +35,32 @@ def layout_losses(
     views: SceneViews,
     matches: Matches,
     occlusion_slack: float = 1.0,
-    completeness_target: str = "first_n",
-    per_room: bool = False,
+    completeness_target: str | None = "first_n",
 ) -> dict[str, Float[Tensor, "*rooms"]]:
     """The four terms of the layout loss (Eq. 7), unweighted.
 
         L_L = lambda_l L_l + lambda_box L_box + lambda_p L_p + lambda_f L_f
 
-    Each term is averaged over the objects that it applies to: in training, over the batches of all
-    processes (`share_of_batch`); with `per_room`, over each room alone, for rooms that are fitted.
-    `boxes_2d` holds the predictions' boxes in the views. `occlusion_slack` is explained in
-    `side_distance`; `completeness_target` is a convention of `paper/losses.py`.
+    Each term is averaged over the objects that it applies to, over the batches of all processes
+    (`share_of_batch`). `boxes_2d` holds the predictions' boxes in the views. `occlusion_slack` is
+    explained in `side_distance`; `completeness_target` is a convention of this module. None is for
+    rooms that are fitted: each room has its own losses, without completeness, since a single image
+    does not show how many objects the room holds (supplement D).
     """
+    per_room = completeness_target is None
     predicted = take(boxes_2d.boxes, matches.prediction, dim=2)
     inside = take(boxes_2d.in_frustum, matches.prediction, dim=2)
     centers = take(scenes.centers_m, matches.prediction, dim=1)
     seen = views.visible & matches.valid.unsqueeze(1)
+    completeness = {}
+    if completeness_target is not None:
+        completeness["completeness"] = completeness_loss(scenes, views, completeness_target)
     return {
         "class": class_loss(scenes, views.object_class, matches, per_room),
         "box": box_loss(
             predicted, views.boxes, views.sides_clear, seen & inside, occlusion_slack, per_room
         ),
-        "completeness": completeness_loss(scenes, views, completeness_target, per_room),
+        **completeness,
         "frustum": frustum_loss(centers, views, seen & ~inside, per_room),
     }
 
@@ -91,19 +95,13 @@ def box_loss(
 
 
 def completeness_loss(
-    scenes: DecodedScenes,
-    views: SceneViews,
-    target: str = "first_n",
-    per_room: bool = False,
-) -> Float[Tensor, "*rooms"]:
+    scenes: DecodedScenes, views: SceneViews, target: str = "first_n"
+) -> Float[Tensor, ""]:
     """L_p of Eq. 7: binary cross entropy of all completeness scores. `target` is the convention of
     their targets (`completeness_targets`)."""
     logits = scenes.completeness_logits
     wanted = completeness_targets(views.is_object.sum(dim=-1), logits.shape[1], target)
     wanted = wanted.to(logits.dtype)
-    if per_room:
-        every = F.binary_cross_entropy_with_logits(logits, wanted, reduction="none")
-        return every.mean(dim=1)
     mean = F.binary_cross_entropy_with_logits(logits, wanted)
     return mean * share_of_batch(views.is_object.any(dim=-1).sum())
 

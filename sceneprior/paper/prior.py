@@ -13,9 +13,9 @@ from sceneprior.core.dataset import ViewDataset
 from sceneprior.core.errors import InputError
 from sceneprior.core.settings import Section
 from sceneprior.core.views import DecodedScenes
+from sceneprior.paper.decoders import ClassBevels, LayoutDecoder
 from sceneprior.paper.latents import CubeConfig, LatentSpace, SphereConfig
 from sceneprior.paper.layers import DecoderConfig, ShapeModule, ShapeModuleConfig
-from sceneprior.paper.layout_decoder import ClassBevels, LayoutDecoder
 from sceneprior.paper.settings import LossConfig, ShapeConfig
 from sceneprior.training.method import RunConfig, Trained, ready_copy
 

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from sceneprior.core.settings import Section
-from sceneprior.training.settings import TrainConfig
+from sceneprior.training.method import TrainConfig
 
 
 class LossConfig(Section):

@@ -56,20 +56,20 @@ def match_and_score(
     boxes: Boxes2D,
     views: SceneViews,
     weights: LossConfig,
-    completeness_target: str,
-    per_room: bool = False,
+    completeness_target: str | None,
 ) -> tuple[dict[str, Float[Tensor, "*rooms"]], Matches]:
     """Match predictions to tracked objects by class and 2D box, and compute the layout losses.
 
-    `per_room` is explained in `layout_losses`. The losses are checked here, before anything is
-    rendered, since the renderer's own error for vertices that are not finite names no room.
+    `completeness_target` is explained in `layout_losses`. The losses are checked here, before
+    anything is rendered, since the renderer's own error for vertices that are not finite names no
+    room.
 
     Raises:
         FloatingPointError: the weighted sum of the losses is not finite.
     """
     matches = match_objects(scenes, boxes, views, weights.match_box, weights.occlusion_slack)
     losses = layout_losses(
-        scenes, boxes, views, matches, weights.occlusion_slack, completeness_target, per_room
+        scenes, boxes, views, matches, weights.occlusion_slack, completeness_target
     )
     check_finite(weighted_sum(losses, weights).detach().sum(), views.room_ids)
     return losses, matches

@@ -27,9 +27,8 @@ from sceneprior.training.callbacks import (
     slurm_plugins,
 )
 from sceneprior.training.checkpoints import check_resumable, read_checkpoint, write_checkpoint
-from sceneprior.training.loader import make_loader
-from sceneprior.training.method import RunConfig, Stage
-from sceneprior.training.settings import without_samples
+from sceneprior.training.method import RunConfig, Stage, without_samples
+from sceneprior.training.steps import make_loader
 
 LOGGERS = ("csv", "tensorboard", "wandb")
 """Names of the loggers that `fit` accepts."""

@@ -15,7 +15,7 @@ from sceneprior.core.dataset import BLANK, MaskStore, ViewDataset
 from sceneprior.core.errors import ShardError
 from sceneprior.core.shards import RoomViews, Shard, list_shards
 from sceneprior.core.views import RoomBoxes
-from sceneprior.training.loader import DrawSampler, make_loader
+from sceneprior.training.steps import DrawSampler, make_loader
 
 
 def dataset(shards, **changes) -> ViewDataset:

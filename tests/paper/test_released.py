@@ -6,8 +6,8 @@ from torch import nn
 from torch.nn import functional as F
 from torch.testing import assert_close
 
+from sceneprior.paper.decoders import SeparateHeads
 from sceneprior.paper.layers import QuerySelfAttention
-from sceneprior.paper.layout_decoder import SeparateHeads
 from sceneprior.paper.transformer import SceneTransformer, TransformerConfig
 
 

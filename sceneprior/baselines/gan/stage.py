@@ -30,12 +30,10 @@ from sceneprior.baselines.gan.semantic_maps import (
 )
 from sceneprior.core.dataset import ViewDataset
 from sceneprior.core.views import DecodedScenes, SceneViews
-from sceneprior.paper.layout_decoder import LayoutDecoder
+from sceneprior.paper.decoders import LayoutDecoder, ShapeDecoderConfig
 from sceneprior.paper.prior import ModelConfig, PriorConfig
-from sceneprior.paper.shape_decoder import ShapeDecoderConfig
 from sceneprior.paper.transformer import TransformerConfig
-from sceneprior.training.method import Stage
-from sceneprior.training.settings import TrainConfig
+from sceneprior.training.method import Stage, TrainConfig
 from sceneprior.training.steps import check_finite, full_precision, log_losses
 
 BETAS = (0.0, 0.99)

@@ -25,8 +25,7 @@ from sceneprior.core.scene import Mesh
 from sceneprior.core.settings import Section
 from sceneprior.core.views import SceneViews
 from sceneprior.paper.layers import mlp
-from sceneprior.training.method import FoundObject, TrainedReconstructor, ready_copy
-from sceneprior.training.settings import ViewDataConfig
+from sceneprior.training.method import FoundObject, TrainedReconstructor, ViewDataConfig, ready_copy
 
 
 class SingleViewModel(Section):

@@ -30,7 +30,7 @@ from sceneprior.baselines.single_view.network import (
 from sceneprior.baselines.single_view.truth import TrueViewDataset, TrueViews
 from sceneprior.core.boxes import box_corners
 from sceneprior.core.scene import Mesh
-from sceneprior.paper.shape_decoder import ShapeDecoder, ShapeDecoderConfig
+from sceneprior.paper.decoders import ShapeDecoder, ShapeDecoderConfig
 from sceneprior.training.steps import full_precision
 
 NEAREST_M, FURTHEST_M, BINS = 0.5, 10.0, 8

@@ -26,8 +26,8 @@ from sceneprior.baselines.single_view.network import (
 from sceneprior.core.cameras import boxes_of_points
 from sceneprior.core.scene import Mesh
 from sceneprior.core.views import SceneViews
+from sceneprior.paper.decoders import ShapeDecoder, ShapeDecoderConfig
 from sceneprior.paper.losses import box_loss, frustum_loss, mean_of_objects, soft_iou
-from sceneprior.paper.shape_decoder import ShapeDecoder, ShapeDecoderConfig
 from sceneprior.render.silhouettes.render import render_silhouettes
 from sceneprior.training.steps import full_precision
 

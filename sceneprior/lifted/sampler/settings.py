@@ -2,7 +2,7 @@
 
 from pydantic import Field, model_validator
 
-from sceneprior.training.settings import TrainConfig
+from sceneprior.training.method import TrainConfig
 
 
 class SamplerConfig(TrainConfig):

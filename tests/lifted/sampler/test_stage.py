@@ -16,7 +16,7 @@ from sceneprior.lifted.sampler.rooms import SamplerRooms, rectangles_of
 from sceneprior.lifted.sampler.settings import SamplerConfig
 from sceneprior.lifted.sampler.stage import SamplerStage
 from sceneprior.training.fit import fit
-from sceneprior.training.loader import make_loader
+from sceneprior.training.steps import make_loader
 
 CPU = {"accelerator": "cpu"}
 
