@@ -40,7 +40,9 @@ def pack(
         raise InputError(f"{out} already exists; name another file, or add --overwrite.")
     found = scores or run / "scores.json"
     measured = read_json(found) if scores is not None or found.is_file() else None
-    stated = None if about is None else _text_of(about)
+    if about is not None and not about.is_file():  # devices and pipes may be endless
+        raise InputError(f"{about} cannot be read: it is missing or not a regular file.")
+    stated = None if about is None else about.read_text(errors="replace")
     run_config(run)
     trained = load_any_run(run)
     card = model_card(trained, out.stem, stated, measured, latents, half)
@@ -58,19 +60,6 @@ def pack(
             "this file they are drawn from 'paper'.",
             err=True,
         )
-
-
-def _text_of(path: Path) -> str:
-    """Text of a regular file; devices and pipes, which may be endless, are refused."""
-    from sceneprior.apps.priors.packed import CARD, LARGEST
-
-    if not path.is_file():
-        raise InputError(f"{path} cannot be read: it is missing or not a regular file.")
-    try:
-        with path.open() as file:
-            return file.read(LARGEST[CARD])  # a card with a longer text is refused later
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read ({error}).") from None
 
 
 def priors(
