@@ -36,10 +36,9 @@ from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.shards import iterate_rooms
 from sceneprior.evaluation.metrics.layout_classifier import layout_classifier_accuracy
-from sceneprior.lifted.requests.relation_checks import Furniture, RelationChecks
-from sceneprior.lifted.requests.relations import OUTWARD, TO_ROOM, TO_TARGET
-from sceneprior.lifted.requests.shape import RoomShape
-from sceneprior.lifted.requests.wishes import RelationWish
+from sceneprior.lifted.requests.floors import Floor, RoomShape
+from sceneprior.lifted.requests.relations import OUTWARD, Furniture, RelationChecks
+from sceneprior.lifted.requests.wishes import TO_ROOM, TO_TARGET, RelationWish
 
 RELATIONS = 2
 """Number of relations per request."""
@@ -167,9 +166,9 @@ def relations_of(
         np.array([[*item.center_m, *item.size_m] for item in half]),
         np.array([classes.index(item.label) for item in half]),
         np.zeros(len(half), dtype=np.int64),  # backs, which relations do not read
-        front,
+        OUTWARD[front],
     )
-    held = RelationChecks(wishes, RoomShape(floor_m), classes).held(furniture)
+    held = RelationChecks(wishes, RoomShape(Floor(floor_m)), classes).held(furniture)
     return [wish for wish, holds in zip(wishes, held, strict=True) if holds]
 
 

@@ -75,7 +75,7 @@ OWNERS = {
     "pydantic": [
         "sceneprior/core/", "sceneprior/training/", "sceneprior/paper/", "sceneprior/lifted/",
         "sceneprior/baselines/", "sceneprior/apps/decoders.py", "sceneprior/apps/experiments/",
-        "sceneprior/apps/requests.py", "data_prep/",
+        "data_prep/",
     ],
     "typer": ["sceneprior/apps/cli/", "data_prep/cli.py"],
     "jinja2": ["sceneprior/evaluation/"],

@@ -1,6 +1,6 @@
 """The Python API, used by the commands: load a trained prior and generate rooms with it."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -24,7 +24,6 @@ from sceneprior.training.method import Trained
 
 if TYPE_CHECKING:
     from sceneprior.apps.reconstruction.reconstruct import Reconstruction
-    from sceneprior.lifted.requests.request import Floor, Openings, Want
 
 
 def load(where: str | Path) -> "Prior":
@@ -101,10 +100,10 @@ class Prior:
         count: int = 1,
         seed: int = 0,
         distribution: str | None = None,
-        floor: "Floor | None" = None,
-        openings: "Openings | None" = None,
+        floor: str | Sequence[Any] | None = None,
+        openings: str | Sequence[Any] | None = None,
         ceiling_m: float | None = None,
-        want: "Want | None" = None,
+        want: str | Mapping[str, Any] | None = None,
         objects: Sequence[SceneObject] | None = None,
         cad: bool = False,
     ) -> list[Scene]:
@@ -191,9 +190,9 @@ class Prior:
         seed: int = 0,
         distribution: str | None = None,
         classes: Sequence[str] | None = None,
-        want: "Want | None" = None,
-        floor: "Floor | None" = None,
-        openings: "Openings | None" = None,
+        want: str | Mapping[str, Any] | None = None,
+        floor: str | Sequence[Any] | None = None,
+        openings: str | Sequence[Any] | None = None,
         ceiling_m: float | None = None,
         cad: bool = False,
     ) -> list[Scene]:
@@ -311,6 +310,6 @@ def _has_walls(scene: Scene) -> bool:
         return True
     if scene.floor_m is None:
         return False
-    from sceneprior.lifted.requests.shape import RoomShape
+    from sceneprior.lifted.requests.floors import Floor
 
-    return not RoomShape(scene.floor_m).is_rectangle
+    return not Floor(scene.floor_m).is_rectangle

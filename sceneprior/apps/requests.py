@@ -1,57 +1,12 @@
 """Read requests from JSON, and requested floors from files of other programs."""
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
-
-from sceneprior.core.checked import checked
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
-from sceneprior.core.scene_json import MOST_OBJECTS, ObjectEntry, read_object
 from sceneprior.interchange.floors import read_floor_file
-
-FORMAT = "sceneprior-request"
-VERSION = 1
-_STRICT = ConfigDict(strict=True, extra="forbid")
-_Pair = Annotated[tuple[float, float], Field(strict=False)]
-
-
-class RelationEntry(BaseModel):
-    """Entry of a relation in a request's JSON."""
-
-    model_config = _STRICT
-
-    subject: str
-    relation: str
-    target: str | None = None
-    count: Annotated[int, Field(ge=1)] = 1
-
-
-class OpeningEntry(BaseModel):
-    """Entry of a door or a window, with both ends, in a request's JSON."""
-
-    model_config = _STRICT
-
-    kind: Literal["door", "window"]
-    start_m: _Pair
-    end_m: _Pair
-    bottom_m: float | None = None
-    top_m: float | None = None
-
-
-class RequestFile(BaseModel):
-    """The JSON of a request; `RequestFile.model_json_schema()` is its JSON Schema."""
-
-    model_config = _STRICT
-
-    format: Literal["sceneprior-request"]
-    version: Literal[1]
-    floor: Annotated[list[_Pair], Field(min_length=3)] | str | None = None
-    openings: list[OpeningEntry | str] = []
-    ceiling_m: float | None = None
-    want: dict[str, list[RelationEntry] | int | str] | str | None = None
-    objects: Annotated[list[ObjectEntry], Field(max_length=MOST_OBJECTS)] = []
+from sceneprior.lifted.requests.request import RequestFile
 
 
 def load_request(path: str | Path) -> dict[str, Any]:
@@ -60,23 +15,12 @@ def load_request(path: str | Path) -> dict[str, Any]:
     Raises:
         InputError: the file is no request.
     """
-    path = Path(path)
-    data = read_json(path)
-    where = f"{path} is not a request, which docs/requests.md describes"
-    entry = checked(RequestFile, data, where)
-    asked: dict[str, Any] = {"floor": entry.floor, "ceiling_m": entry.ceiling_m}
-    asked["openings"] = [
-        each if isinstance(each, str) else each.model_dump(exclude_none=True)
-        for each in entry.openings
-    ]
-    asked["want"] = entry.want
-    if isinstance(entry.want, dict):
-        asked["want"] = {
-            key: [each.model_dump() for each in value] if isinstance(value, list) else value
-            for key, value in entry.want.items()
-        }
-    asked["objects"] = [read_object(path, item) for item in entry.objects]
-    return {key: value for key, value in asked.items() if value not in (None, [])}
+    data = read_json(Path(path))
+    if not isinstance(data, dict):
+        raise InputError(
+            f"{path} is not a request, which docs/requests.md describes: expected a JSON object."
+        )
+    return RequestFile.of(str(path), **data).parts()
 
 
 def with_floor_of_file(asked: dict[str, Any]) -> dict[str, Any]:

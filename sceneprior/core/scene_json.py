@@ -165,7 +165,7 @@ def read_scene(path: Path) -> Scene:
     )
 
 
-def read_object(path: Path, item: ObjectEntry) -> SceneObject:
+def read_object(path: Path | str, item: ObjectEntry) -> SceneObject:
     """An object of a file; its boxes are checked, its class is not."""
     check_box(path, item.label, item.center_m, item.size_m)
     turned = _turned_of(path, item)
@@ -189,7 +189,7 @@ def check_box(
 
 
 def check_solids(
-    path: Path,
+    path: Path | str,
     label: str,
     center_m: Sequence[float],
     size_m: Sequence[float],
@@ -248,7 +248,7 @@ def unit_guess(numbers: Any) -> str:
     return f"Are these {unit}? Give metres."
 
 
-def _turned_of(path: Path, item: ObjectEntry) -> Turned | None:
+def _turned_of(path: Path | str, item: ObjectEntry) -> Turned | None:
     """Oriented box of an entry, if it has one; it must fill the axis-aligned box."""
     if item.yaw_rad is None and item.own_size_m is None:
         return None

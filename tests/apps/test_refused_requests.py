@@ -106,7 +106,10 @@ FILES: dict[str, dict[str, Any]] = {
     "file_format": {"format": "sceneprior-scene"},
     "file_ceiling_word": {"ceiling_m": "high"},
     "file_relation_half": {"want": {"relations": [{"subject": "desk"}]}},
-    "file_list": {"openings": "door"},
+    "file_openings_number": {"openings": 5},
+    "file_want_number": {"want": 5},
+    "file_objects_number": {"objects": 5},
+    "file_object_half": {"objects": [{"class": "desk"}]},
 }
 
 

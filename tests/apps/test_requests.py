@@ -10,9 +10,10 @@ import pytest
 from cli_helpers import one_sentence
 
 import sceneprior
-from sceneprior.apps.requests import RequestFile, load_request, merged
+from sceneprior.apps.requests import load_request, merged
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Opening, Scene, SceneObject
+from sceneprior.lifted.requests.request import RequestFile
 from sceneprior.render.scene_files import save
 
 BED = {"class": "double_bed", "center_m": [0.0, 0.3, -0.4], "size_m": [1.8, 0.6, 2.0]}
@@ -49,28 +50,6 @@ def test_a_file_asks_what_its_keys_say(prior, tmp_path):
     assert "want" in RequestFile.model_json_schema()["properties"]
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"objects": [{**BED, "size_m": [180, 60, 200]}]}, "20 m long.*Are these centimetres"),
-        ({"floor": [[0, 0], [1, 2]]}, "floor.*at least 3 items"),
-        ({"doors": 1}, "doors is 1; extra inputs are not permitted"),
-        ({"version": 2}, "version is 2; input should be 1"),
-        ({"ceiling_m": "high"}, "ceiling_m is 'high'"),
-        ({"want": {"relations": [{"subject": "desk"}]}}, "is not a request"),
-    ],
-)
-def test_other_files_are_a_sentence(changes, message, tmp_path):
-    with pytest.raises(InputError, match=message):
-        load_request(written(tmp_path, **changes))
-
-
-def test_a_given_piece_that_the_prior_does_not_know_is_a_sentence(prior, tmp_path):
-    path = written(tmp_path, objects=[{**BED, "class": "piano"}])
-    with pytest.raises(InputError, match="A given object is a 'piano', which this run does not"):
-        prior.sample(1, **load_request(path))
-
-
 def test_a_part_is_in_the_file_or_in_the_options():
     assert merged({"floor": "4x3", "want": None}, {"want": "a bed"}) == {
         "floor": "4x3", "want": "a bed",
@@ -87,13 +66,6 @@ def test_a_floor_of_a_file_brings_its_door(prior, tmp_path):
     assert room.openings == (door,) and (room.floor_m == outline).all()
     (room,) = prior.sample(1, floor=f"{tmp_path}/plan.json", openings="window@north")
     assert [each.kind for each in room.openings] == ["window"]
-
-
-def test_a_sentence_and_an_option_do_not_both_have_a_floor(prior):
-    with pytest.raises(InputError, match="and the sentence asks for 4x3 m; leave one out"):
-        prior.sample(1, floor="5x3", want="a 4 x 3 m bedroom")
-    with pytest.raises(InputError, match=r"An opening has corners.*give the floor, too"):
-        prior.sample(1, openings=[Opening("door", (0, 0), (1, 0), 0.0, 2.0)])
 
 
 def test_a_room_with_walls_is_completed_between_them(prior):
@@ -121,24 +93,6 @@ def test_a_floor_in_its_place_replaces_that_of_the_scene(prior):
     assert all(each["holds"] for each in room.extra["wishes"])
     (room,) = prior.complete(scene, 1, ceiling_m=2.5)
     assert (room.floor_m == outline).all() and room.openings == (door,) and room.ceiling_m == 2.5
-    with pytest.raises(
-        InputError, match="`classes` lists the classes to add, but the request also has want"
-    ):
-        prior.complete(scene, 1, classes=["nightstand"], want="a nightstand")
-
-
-def test_objects_in_centimetres_are_a_sentence(prior):
-    bed = SceneObject("double_bed", (0.0, 0.3, 0.0), (180.0, 60.0, 200.0))
-    scene = Scene("mine", "front3d_bedroom", (bed,))
-    for ask in (
-        lambda: prior.sample(1, objects=[bed]),
-        lambda: prior.complete(scene, 1),
-        lambda: prior.complete(scene, 1, want="a nightstand"),
-    ):
-        with pytest.raises(InputError, match=r"20 m long.*Are these centimetres\? Give metres"):
-            ask()
-    with pytest.raises(InputError, match=r"ceiling is 260 m high.*Are these centimetres"):
-        prior.sample(1, ceiling_m=260.0)
 
 
 def test_complete_takes_requests(command, tmp_path):

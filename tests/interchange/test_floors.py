@@ -14,6 +14,7 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Opening, Scene, SceneObject
 from sceneprior.interchange.export import export_scenes
 from sceneprior.interchange.floors import FloorPlan, read_floor_file
+from sceneprior.lifted.requests.floors import Floor
 from sceneprior.lifted.requests.openings import place_openings
 from sceneprior.render.scene_files import save
 
@@ -103,7 +104,7 @@ def test_a_room_of_structured3d_has_its_door_and_its_window(room, tmp_path):
     assert np.allclose(window, [(0.6, -5), (1.5, -5)], atol=1e-9)
     heights = [(each.bottom_m, each.top_m) for each in found.openings]
     assert np.allclose(heights, [(0, 2.1), (0.9, 2.3)], atol=1e-9)
-    assert place_openings(found.outline_m, found.openings, np.random.default_rng(0))
+    assert place_openings(Floor(found.outline_m), found.openings, np.random.default_rng(0))
 
 
 def test_the_door_is_in_the_wall_of_the_other_room_too_and_columns_are_filled(tmp_path):

@@ -15,8 +15,8 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene
 from sceneprior.core.shell import SHELLS, ShellName
 from sceneprior.interchange.export import SIMULATORS, export_scenes
+from sceneprior.lifted.requests.floors import read_floor
 from sceneprior.lifted.requests.openings import read_openings
-from sceneprior.lifted.requests.shape import read_floor
 from sceneprior.render.scene_files import check_names, save
 
 if TYPE_CHECKING:

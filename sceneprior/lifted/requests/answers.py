@@ -13,8 +13,8 @@ from sceneprior.core.repeatable import check_seed, single_threaded
 from sceneprior.core.scene import Opening, Scene
 from sceneprior.lifted.config import TrainedLifted
 from sceneprior.lifted.requests.draw import Answer, draw_requested
-from sceneprior.lifted.requests.relation_checks import RelationChecks, furniture_in
-from sceneprior.lifted.requests.request import Request, make_request
+from sceneprior.lifted.requests.relations import RelationChecks, furniture_in
+from sceneprior.lifted.requests.request import Conditions, RoomRequest
 from sceneprior.lifted.sampled import drawn_by_sampler, scene_of
 from sceneprior.paper.prior import TrainedPrior
 from sceneprior.paper.sampling import scene_names
@@ -48,13 +48,7 @@ def sample_requested(
     assert with_sampler.sampler is not None, "checked by drawn_by_sampler"
     classes = label_set(with_sampler.config.label_set)
     known = [classes[row] for row in with_sampler.sampler.drawn_classes]
-    request = make_request(known, with_sampler.config.label_set, **asked)
-    for item in request.objects:
-        if item.label not in classes[1:]:
-            raise InputError(
-                f"A given object is a '{item.label}', which this run does not know; its classes "
-                f"are {', '.join(classes[1:])}."
-            )
+    request = RoomRequest.of(**asked).conditions(known, with_sampler.config.label_set)
     answers = draw_requested(with_sampler.sampler, request, classes, count, seed)
     names = scene_names(count, seed)
     if name is not None:
@@ -79,7 +73,7 @@ def _told(value: Any) -> Any:
 
 
 def _scene(
-    trained: TrainedLifted, name: str, answer: Answer, request: Request, asked: Mapping[str, Any]
+    trained: TrainedLifted, name: str, answer: Answer, request: Conditions, asked: Mapping[str, Any]
 ) -> Scene:
     scene = scene_of(trained, name, answer.room, 0)
     counts = Counter(item.label for item in scene.objects)
@@ -104,7 +98,7 @@ def _scene(
             for own, drawn in zip(given, scene.objects, strict=False)
         )
         + scene.objects[len(given) :],
-        floor_m=shape.outline_m,
+        floor_m=shape.floor.outline_m,
         openings=shape.openings,
         ceiling_m=shape.ceiling_m,
         extra={

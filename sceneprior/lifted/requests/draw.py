@@ -10,11 +10,10 @@ import torch
 from sceneprior.core.colliders import HUNG
 from sceneprior.core.errors import InputError
 from sceneprior.lifted.requests.particles import PARTICLES, Particles, start_particles
-from sceneprior.lifted.requests.placement_rules import PlacementRules
 from sceneprior.lifted.requests.plans import RoomPlan, check_area, plan_room, warn_of_area
-from sceneprior.lifted.requests.relation_checks import furniture_in
-from sceneprior.lifted.requests.request import Request
-from sceneprior.lifted.requests.shape import RoomShape
+from sceneprior.lifted.requests.relations import furniture_in
+from sceneprior.lifted.requests.request import Conditions
+from sceneprior.lifted.requests.rules import PlacementRules
 from sceneprior.lifted.requests.steps import Rejections, place_next
 from sceneprior.lifted.requests.wishes import RelationWish, check_wishes
 from sceneprior.lifted.rooms import PosedRooms
@@ -44,7 +43,7 @@ class Answer:
 
 @torch.no_grad()
 def draw_requested(
-    sampler: RoomSampler, request: Request, classes: tuple[str, ...], count: int, seed: int
+    sampler: RoomSampler, request: Conditions, classes: tuple[str, ...], count: int, seed: int
 ) -> list[Answer]:
     """Sample rooms that meet a request.
 
@@ -93,7 +92,7 @@ def draw_requested(
 
 
 def _given(
-    sampler: RoomSampler, request: Request, classes: tuple[str, ...], seed: int
+    sampler: RoomSampler, request: Conditions, classes: tuple[str, ...], seed: int
 ) -> PosedRooms:
     """The given objects as one room with looks."""
     objects = request.objects
@@ -104,8 +103,8 @@ def _given(
         torch.tensor(boxes_m).float().reshape(1, -1, 6),
     )  # fmt: skip
     rectangle_m = np.array([0.0, 0.0, 4.0, 4.0])
-    if request.outline_m is not None:
-        rectangle_m = RoomShape(request.outline_m).rectangle_m
+    if request.floor is not None:
+        rectangle_m = request.floor.rectangle_m
     extents_m = torch.from_numpy(rectangle_m[None]).float()
     uniform = np.random.default_rng([seed, 0]).random((1, len(objects), 1 + LOOKS))
     none = torch.zeros(1, 0, dtype=torch.int64)

@@ -1,5 +1,6 @@
 """Doors and windows of requests: their places, and the space in front that must stay free."""
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,11 +10,12 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
+from sceneprior.core.checked import shown
 from sceneprior.core.errors import InputError
-from sceneprior.core.outline import Wall, space_before, wall_of_opening, walls_of
+from sceneprior.core.outline import Wall, space_before
 from sceneprior.core.scene import Opening
 from sceneprior.core.scene_json import check_openings
-from sceneprior.lifted.requests.shape import RoomShape
+from sceneprior.lifted.requests.floors import Floor, RoomShape
 
 DOOR_M = (0.9, 0.0, 2.0)
 """Default width, lower edge and upper edge of a door."""
@@ -30,8 +32,6 @@ COMPASS = {"north": (0.0, -1.0), "east": (1.0, 0.0), "south": (0.0, 1.0), "west"
 """Directions (x, z) out of the room by the names of walls. North is up in top-down pictures."""
 _TEXT = re.compile(r"\s*(door|window)s?(?:\s*@\s*(\w+)(?:\s*:\s*(\d+\.?\d*))?)?\s*")
 
-Openings = str | Sequence[Any]
-
 
 @dataclass(frozen=True)
 class WantedOpening:
@@ -45,7 +45,7 @@ class WantedOpening:
     wall of `COMPASS`."""
 
 
-def read_openings(openings: Openings) -> tuple[Opening | WantedOpening, ...]:
+def read_openings(openings: Any) -> tuple[Opening | WantedOpening, ...]:
     """Read doors and windows from a string or a list.
 
     A string has entries `door`, `door@north`, `door@2` (the side from corner 2 of the floor) or
@@ -55,6 +55,11 @@ def read_openings(openings: Openings) -> tuple[Opening | WantedOpening, ...]:
     Raises:
         InputError: an entry is malformed.
     """
+    if not isinstance(openings, Sequence):
+        raise InputError(
+            f"The openings are {shown(openings)}; expected text such as door,window@north, or a "
+            "list."
+        )
     entries = openings.split(",") if isinstance(openings, str) else list(openings)
     if len(entries) > MOST_OPENINGS:
         raise InputError(
@@ -107,49 +112,46 @@ def moved(
 
 
 def place_openings(
-    outline_m: Float[np.ndarray, "corners 2"],
-    wanted: Sequence[Opening | WantedOpening],
-    draws: np.random.Generator,
+    floor: Floor, wanted: Sequence[Opening | WantedOpening], draws: np.random.Generator
 ) -> tuple[Opening, ...]:
     """Doors and windows of one room. Unspecified positions are sampled uniformly along the walls.
 
     Raises:
         InputError: an opening lies on no side of the floor, or there is no free wall for it.
     """
-    sides = walls_of(outline_m)
     placed = [each for each in wanted if isinstance(each, Opening)]
-    check_openings("The request", outline_m, placed)
+    check_openings("The request", floor.outline_m, placed)
     for each in sorted(
         (each for each in wanted if isinstance(each, WantedOpening)),
         key=lambda each: (each.at_m is None, each.wall is None),
     ):
-        placed.append(_placed(each, sides, placed, draws))
+        placed.append(_placed(each, floor.walls, placed, draws))
     return tuple(placed)
 
 
 def _placed(
-    wanted: WantedOpening, sides: list[Wall], there: list[Opening], draws: np.random.Generator
+    wanted: WantedOpening, walls: list[Wall], there: list[Opening], draws: np.random.Generator
 ) -> Opening:
     width_m, bottom_m, top_m = DOOR_M if wanted.kind == "door" else WINDOW_M
-    choice = walls_for(wanted, sides)
-    room_m = np.array([max(side.length_m - width_m - 2 * MARGIN_M, 0.0) for side in choice])
+    choice = _choice(wanted, walls)
+    room_m = np.array([max(wall.length_m - width_m - 2 * MARGIN_M, 0.0) for wall in choice])
     taken = [shapely.LineString([each.start_m, each.end_m]) for each in there]
     where = f"on {wanted.wall} " if wanted.wall is not None else ""
     for _ in range(PLACES):
         if wanted.at_m is not None:
-            side, at_m = choice[0], wanted.at_m
-            if not width_m / 2 <= at_m <= side.length_m - width_m / 2:
+            wall, at_m = choice[0], wanted.at_m
+            if not width_m / 2 <= at_m <= wall.length_m - width_m / 2:
                 raise InputError(
-                    f"A {wanted.kind} {where}is {at_m:g} m along a wall of {side.length_m:.2f} m; "
+                    f"A {wanted.kind} {where}is {at_m:g} m along a wall of {wall.length_m:.2f} m; "
                     f"it is {width_m:g} m wide and must lie in the wall."
                 )
         elif room_m.sum() > 0:
             row = draws.choice(len(choice), p=room_m / room_m.sum())
-            side = choice[row]
+            wall = choice[row]
             at_m = width_m / 2 + MARGIN_M + room_m[row] * draws.random()
         else:
             break
-        first, last = (side.start_m + side.direction * (at_m + s * width_m / 2) for s in (-1, 1))
+        first, last = (wall.start_m + wall.direction * (at_m + s * width_m / 2) for s in (-1, 1))
         line = shapely.LineString([first, last])
         if all(line.distance(other) >= MARGIN_M for other in taken):
             return Opening(wanted.kind, _pair(first), _pair(last), bottom_m, top_m)
@@ -161,23 +163,23 @@ def _placed(
     )
 
 
-def walls_for(wanted: WantedOpening, sides: list[Wall]) -> list[Wall]:
-    """Sides on which an opening may lie. Walls of `COMPASS` run from west to east or from north to
+def _choice(wanted: WantedOpening, walls: list[Wall]) -> list[Wall]:
+    """Walls on which an opening may lie. Walls of `COMPASS` run from west to east or from north to
     south."""
     if wanted.wall is None:
-        return sides if wanted.at_m is None else sides[:1]
+        return walls if wanted.at_m is None else walls[:1]
     if isinstance(wanted.wall, int):
-        if wanted.wall >= len(sides):
+        if wanted.wall >= len(walls):
             raise InputError(
                 f"A {wanted.kind} is on side {wanted.wall}, but the floor has sides 0 to "
-                f"{len(sides) - 1}."
+                f"{len(walls) - 1}."
             )
-        return [sides[wanted.wall]]
+        return [walls[wanted.wall]]
     outwards = np.array(COMPASS[wanted.wall])
-    facing = [side for side in sides if side.outward @ outwards > np.cos(np.pi / 4) - 1e-6]
+    facing = [wall for wall in walls if wall.outward @ outwards > np.cos(np.pi / 4) - 1e-6]
     if not facing:
         raise InputError(f"The floor has no wall in the {wanted.wall}; name it by its number.")
-    longest = max(facing, key=lambda side: side.length_m)
+    longest = max(facing, key=lambda wall: wall.length_m)
     backwards = (longest.end_m - longest.start_m).sum() < 0
     return [Wall(longest.end_m, longest.start_m, longest.outward) if backwards else longest]
 
@@ -199,16 +201,9 @@ def zones_of(shape: RoomShape) -> dict[str, list[Zone]]:
     which it swings, as deep as the door is wide; in front of a window, the space above the sill."""
     zones: dict[str, list[Zone]] = {"door": [], "window": []}
     for each in shape.openings:
-        start, end = np.array(each.start_m), np.array(each.end_m)
-        depth_m = float(np.linalg.norm(end - start)) if each.kind == "door" else BEFORE_WINDOW_M
+        is_door = each.kind == "door"
+        depth_m = math.dist(each.start_m, each.end_m) if is_door else BEFORE_WINDOW_M
         # 1 cm smaller on all sides, so that furniture may touch the zone.
-        polygon = space_before(each, inward_of(shape, each), depth_m).buffer(-0.01)
-        low_m = 0.0 if each.kind == "door" else each.bottom_m
-        zones[each.kind].append(Zone(polygon, low_m, each.top_m))
+        polygon = space_before(each, shape.inward(each), depth_m).buffer(-0.01)
+        zones[each.kind].append(Zone(polygon, 0.0 if is_door else each.bottom_m, each.top_m))
     return zones
-
-
-def inward_of(shape: RoomShape, opening: Opening) -> Float[np.ndarray, "2"]:
-    """Unit normal, into the room, of the wall with this door or window."""
-    walls = walls_of(shape.outline_m)
-    return walls[wall_of_opening(walls, opening)].inward

@@ -91,7 +91,7 @@ def start_particles(
         F.pad(torch.tensor(plan.upcoming).long(), (0, sampler.max_objects - len(plan.upcoming)))
         for plan in plans
     ]
-    rectangles = [torch.from_numpy(plan.shape.rectangle_m).float() for plan in plans]
+    rectangles = [torch.from_numpy(plan.shape.floor.rectangle_m).float() for plan in plans]
     return Particles(
         plans, rooms, rooms.is_object.sum(dim=1),
         torch.stack(upcoming).repeat_interleave(PARTICLES, dim=0),

@@ -5,13 +5,16 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from sceneprior.core.errors import InputError, InputWarning
+from sceneprior.core.mixtures import draw_index
 from sceneprior.core.outline import rectangle
-from sceneprior.lifted.requests.contents import draw_contents, required_rows
+from sceneprior.lifted.requests.floors import Floor, RoomShape
 from sceneprior.lifted.requests.openings import place_openings
-from sceneprior.lifted.requests.request import Request
-from sceneprior.lifted.requests.shape import RoomShape
+from sceneprior.lifted.requests.request import Conditions
+from sceneprior.lifted.requests.wishes import Wishes
+from sceneprior.lifted.sampler.contents import END
 from sceneprior.lifted.sampler.network import RoomSampler
 
 RECTANGLES = 16
@@ -40,7 +43,7 @@ class RoomPlan(NamedTuple):
 
 def plan_room(
     sampler: RoomSampler,
-    request: Request,
+    request: Conditions,
     classes: tuple[str, ...],
     draws: tuple[np.random.Generator, np.random.Generator],
     required_first: bool,
@@ -55,13 +58,13 @@ def plan_room(
     """
     given = [classes.index(item.label) for item in request.objects]
     required = required_rows(request.wishes, classes, given)
-    outline_m = request.outline_m
-    if outline_m is None:
-        outline_m = _drawn_outline(sampler, request, [*given, *required], draws[0])
-    openings = place_openings(outline_m, request.openings, draws[0])
-    shape = RoomShape(outline_m, openings, request.ceiling_m)
+    floor = request.floor
+    if floor is None:
+        floor = Floor(_drawn_outline(sampler, request, [*given, *required], draws[0]))
+    openings = place_openings(floor, request.openings, draws[0])
+    shape = RoomShape(floor, openings, request.ceiling_m)
     uniform = draws[1].random(sampler.max_objects)
-    upcoming = draw_contents(sampler, request.wishes, classes, given, shape.extents_m, uniform)
+    upcoming = draw_contents(sampler, request.wishes, classes, given, floor.extents_m, uniform)
     is_required = np.arange(len(upcoming)) < len(required)
     footprints_m2 = sampler.footprints_m2.numpy()[upcoming] if upcoming else np.zeros(0)
     order = np.lexsort([-footprints_m2, ~is_required & required_first])
@@ -69,7 +72,7 @@ def plan_room(
 
 
 def _drawn_outline(
-    sampler: RoomSampler, request: Request, needed: list[int], draws: np.random.Generator
+    sampler: RoomSampler, request: Conditions, needed: list[int], draws: np.random.Generator
 ) -> np.ndarray:
     needed_m2 = float(sampler.footprints_m2[needed].sum()) / FULL_SHARE
     numbers = torch.from_numpy(draws.random((RECTANGLES, 5))).float()
@@ -85,12 +88,12 @@ def _drawn_outline(
     return rectangle(-half, half)
 
 
-def warn_of_area(sampler: RoomSampler, request: Request) -> None:
+def warn_of_area(sampler: RoomSampler, request: Conditions) -> None:
     """Warn if hardly any floor that the sampler draws is as small, or as large, as the requested
     one: the network extrapolates there, and the usual furniture may not fit."""
-    if request.outline_m is None:
+    if request.floor is None:
         return
-    area_m2 = RoomShape(request.outline_m).polygon.area
+    area_m2 = request.floor.polygon.area
     # The logarithm of an area is the sum of those of its extents, so it is normal, too.
     mean = sampler.rectangle_means[:, 2:].sum(dim=1)
     deviation = sampler.rectangle_factors[:, 2:].sum(dim=1).norm(dim=1)
@@ -106,15 +109,15 @@ def warn_of_area(sampler: RoomSampler, request: Request) -> None:
             )
 
 
-def check_area(sampler: RoomSampler, request: Request, classes: tuple[str, ...]) -> None:
+def check_area(sampler: RoomSampler, request: Conditions, classes: tuple[str, ...]) -> None:
     """Reject requests whose objects need more floor than the request has.
 
     Raises:
         InputError: the required objects at their smallest cover `CROWDED_SHARE` of the floor.
     """
-    if request.outline_m is None:
+    if request.floor is None:
         return
-    area_m2 = RoomShape(request.outline_m).polygon.area
+    area_m2 = request.floor.polygon.area
     given = [classes.index(item.label) for item in request.objects]
     least_m2 = 0.0
     for index in required_rows(request.wishes, classes, given):
@@ -126,3 +129,50 @@ def check_area(sampler: RoomSampler, request: Request, classes: tuple[str, ...])
             f"The required objects cover {least_m2:.1f} square metres at their smallest, but the "
             f"floor has {area_m2:.1f}; ask for fewer, or for a larger floor."
         )
+
+
+def required_rows(wishes: Wishes, classes: tuple[str, ...], given: list[int]) -> list[int]:
+    """The class index of each object that the wishes require beyond those in `given`, the class
+    indices of the objects that are already there."""
+    required = []
+    for label in wishes.labels:
+        index = classes.index(label)
+        required += [index] * max(0, wishes.bounds(label)[0] - given.count(index))
+    return required
+
+
+def draw_contents(
+    sampler: RoomSampler,
+    wishes: Wishes,
+    classes: tuple[str, ...],
+    given: list[int],
+    extents_m: Float[np.ndarray, "2"],
+    uniform: Float[np.ndarray, " slots"],
+) -> list[int]:
+    """Classes to add to the given objects: first those that the wishes require, then others.
+
+    The network was trained to continue any subset of a room's classes, so it draws the others given
+    the required ones. A class that has reached its largest allowed number is excluded.
+    """
+    added = required_rows(wishes, classes, given)
+    counts = torch.zeros(1, len(sampler.contents.known))
+    for index in (*given, *added):
+        counts[0, index] += 1
+    most = torch.full_like(counts[0], torch.inf)
+    for label in wishes.labels:
+        largest = wishes.bounds(label)[1]
+        if largest is not None:
+            most[classes.index(label)] = largest
+    extents = torch.from_numpy(extents_m).to(counts)[None]
+    for chance in torch.from_numpy(uniform).float():
+        if int(counts.sum()) >= sampler.max_objects:
+            break
+        full = counts[0] >= most
+        full[END] = False
+        logits = sampler.contents(counts, extents).masked_fill(full, -torch.inf)
+        index = int(draw_index(logits, chance[None]))
+        if index == END:
+            break
+        added.append(index)
+        counts[0, index] += 1
+    return added

@@ -1,4 +1,5 @@
-"""Relations that can be requested: a closed list, on axis-aligned boxes with a front.
+"""Relations that can be requested: a closed list, on axis-aligned boxes with a front, and whether
+they hold in furnished and in partly furnished rooms.
 
 InstructScene (Lin and Mu, ICLR 2024; its `compute_loc_rel`) has left, right, front and behind as
 sectors of 90 degrees between centres on the floor, up to 3 m, "closely" below 1 m, and above and
@@ -21,24 +22,22 @@ its sill |
 | far from | the centres are more than `FAR_M` apart, beyond which InstructScene has no relation |
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
 
 import numpy as np
 import shapely
 from jaxtyping import Bool, Float, Int
+from torch import Tensor
 
-from sceneprior.core.outline import walls_of
+from sceneprior.core.outline import Wall
 from sceneprior.core.scene import Opening
-from sceneprior.lifted.requests.openings import inward_of
-from sceneprior.lifted.requests.shape import RoomShape
+from sceneprior.lifted.requests.floors import Floor, RoomShape
+from sceneprior.lifted.requests.wishes import OPENINGS, RelationWish
+from sceneprior.lifted.rooms import PosedRooms
+from sceneprior.lifted.sampler.frames import side_of
+from sceneprior.lifted.sampler.network import RoomSampler
 
-TO_ROOM = ("at a wall", "in a corner")
-"""Relations to the room, which have no target."""
-TO_TARGET = ("beside", "in front of", "facing", "under", "near", "far from")
-"""Relations to another object, a door or a window."""
-RELATIONS = (*TO_TARGET, *TO_ROOM)
-OPENINGS = ("door", "window")
-"""Targets that are not furniture."""
 BESIDE_M = 0.5
 NEAR_M = 1.0
 """InstructScene's threshold of "closely", applied to footprints in place of centres: the centres of
@@ -55,31 +54,54 @@ OUTWARD = np.array([(0.0, -1.0), (-1.0, 0.0), (0.0, 1.0), (1.0, 0.0)])
 """Direction (x, z) towards the sides low z, low x, high z and high x (`side_of`)."""
 
 
-class Items(NamedTuple):
-    """Objects, doors or windows between which relations hold; all arrays have a row per item."""
+class Furniture(NamedTuple):
+    """Objects of a room, or its doors or windows, with their classes; all arrays have a row per
+    object."""
 
-    boxes_m: Float[np.ndarray, "items 6"]
+    boxes_m: Float[np.ndarray, "objects 6"]
     """Centre and full extents."""
-    front: Float[np.ndarray, "items 2"]
-    """Unit vector (x, z) along which the front points."""
-    is_lamp: Bool[np.ndarray, " items"]
+    object_class: Int[np.ndarray, " objects"]
+    """Index into the label set; -1 for doors and windows."""
+    back: Int[np.ndarray, " objects"]
+    """Side that is nearest to walls on average: 0 to 3 for low z, low x, high z, high x."""
+    front: Float[np.ndarray, "objects 2"]
+    """Unit vector (x, z) along which the front points; it need not be opposite to `back`."""
 
-    def rows(self, rows: Int[np.ndarray, " some"] | Bool[np.ndarray, " items"]) -> "Items":
-        """The items of these rows."""
-        return Items(*(part[rows] for part in self))
+    def rows(self, rows: Int[np.ndarray, " some"] | slice) -> "Furniture":
+        """The objects of these rows."""
+        return Furniture(*(part[rows] for part in self))
+
+    def joined(self, others: "Furniture") -> "Furniture":
+        """These objects, followed by others."""
+        return Furniture(*map(np.concatenate, zip(self, others, strict=True)))
 
 
-def opening_items(shape: RoomShape, kind: str) -> Items:
+def furniture_of(
+    sampler: RoomSampler,
+    boxes_m: Float[Tensor, "objects 6"],
+    object_class: Int[Tensor, " objects"],
+    looks: Int[Tensor, " objects"],
+) -> Furniture:
+    """Objects, with the sides of their backs and fronts, which follow from their looks."""
+    back, front = (side_of(looks, sides).numpy() for sides in (sampler.backs, sampler.fronts))
+    return Furniture(boxes_m.double().numpy(), object_class.numpy(), back, OUTWARD[front])
+
+
+def furniture_in(sampler: RoomSampler, rooms: PosedRooms, row: int) -> Furniture:
+    """The objects of a room in a batch."""
+    assert rooms.looks is not None
+    here = rooms.is_object[row]
+    return furniture_of(
+        sampler, rooms.boxes_m[row, here], rooms.object_class[row, here], rooms.looks[row, here]
+    )
+
+
+def opening_items(shape: RoomShape, kind: str) -> Furniture:
     """The doors or windows of a room, as flat boxes whose front points into the room."""
-    boxes, fronts = [], []
-    for opening in shape.openings:
-        if opening.kind == kind:
-            boxes.append(_opening_box(opening))
-            fronts.append(inward_of(shape, opening))
-    return Items(
-        np.array(boxes).reshape(-1, 6), np.array(fronts).reshape(-1, 2),
-        np.zeros(len(boxes), dtype=bool),
-    )  # fmt: skip
+    own = [each for each in shape.openings if each.kind == kind]
+    boxes = np.array([_opening_box(each) for each in own]).reshape(-1, 6)
+    fronts = np.array([shape.inward(each) for each in own]).reshape(-1, 2)
+    return Furniture(boxes, np.full(len(own), -1), np.zeros(len(own), dtype=np.int64), fronts)
 
 
 def _opening_box(opening: Opening) -> list[float]:
@@ -90,9 +112,16 @@ def _opening_box(opening: Opening) -> list[float]:
 
 
 def related(
-    relation: str, subjects: Items, targets: Items, to_window: bool = False
+    relation: str,
+    subjects: Furniture,
+    targets: Furniture,
+    to: Literal["window", "lamp"] | None = None,
 ) -> Bool[np.ndarray, "subjects targets"]:
-    """True where a relation of `TO_TARGET` holds between a subject and a target."""
+    """True where a relation of `TO_TARGET` holds between a subject and a target.
+
+    Args:
+        to: Given if the targets are windows or lamps, under which objects stand in other ways.
+    """
     here, there = subjects.boxes_m[:, None], targets.boxes_m[None]
     offset = (here - there)[..., [0, 2]]
     gaps = np.abs(offset) - (here + there)[..., [3, 5]] / 2
@@ -114,12 +143,12 @@ def related(
     assert relation == "under", relation
     top = here[..., 1] + here[..., 4] / 2
     below = top <= there[..., 1] - there[..., 4] / 2 + 1e-3
-    if to_window:
+    if to == "window":
         before = np.where(along, gaps, -np.inf).max(axis=-1) <= REACH_M
         return np.asarray(before & (across < 0) & below)
     within = (np.abs(offset) <= there[..., [3, 5]] / 2).all(axis=-1)
     within |= (np.abs(offset) <= here[..., [3, 5]] / 2).all(axis=-1)
-    return np.asarray(within & (below | targets.is_lamp))
+    return np.asarray(within & (below | (to == "lamp")))
 
 
 def _in_sector(
@@ -133,14 +162,14 @@ def _in_sector(
 
 
 def related_to_room(
-    relation: str, subjects: Items, shape: RoomShape
+    relation: str, subjects: Furniture, floor: Floor
 ) -> Bool[np.ndarray, " subjects"]:
     """True for subjects for which a relation of `TO_ROOM` holds."""
     if relation == "at a wall":
-        walls, least = shape.polygon.exterior, AT_WALL_M
+        walls, least = floor.polygon.exterior, AT_WALL_M
     else:
         assert relation == "in a corner", relation
-        walls, least = shapely.MultiPoint(_convex_corners(shape.outline_m)), CORNER_M
+        walls, least = shapely.MultiPoint(_convex_corners(floor.walls)), CORNER_M
     return np.asarray(shapely.distance(footprints(subjects.boxes_m), walls) <= least)
 
 
@@ -150,12 +179,68 @@ def footprints(boxes_m: Float[np.ndarray, "boxes 6"]) -> np.ndarray:
     return np.asarray(shapely.box(x - width / 2, z - depth / 2, x + width / 2, z + depth / 2))
 
 
-def _convex_corners(outline_m: Float[np.ndarray, "corners 2"]) -> Float[np.ndarray, "some 2"]:
+def _convex_corners(walls: Sequence[Wall]) -> Float[np.ndarray, "some 2"]:
     """Corners of a floor with an interior angle below 150 degrees."""
-    sides = walls_of(outline_m)
     kept = []
-    for before, side in zip([sides[-1], *sides], sides, strict=False):
-        turning = before.direction @ side.direction < np.cos(np.pi / 6)
-        if turning and side.direction @ before.inward > 0:
-            kept.append(side.start_m)
+    for before, wall in zip([walls[-1], *walls], walls, strict=False):
+        turning = before.direction @ wall.direction < np.cos(np.pi / 6)
+        if turning and wall.direction @ before.inward > 0:
+            kept.append(wall.start_m)
     return np.array(kept).reshape(-1, 2)
+
+
+class RelationChecks:
+    """Checks of the requested relations of one room.
+
+    Args:
+        wishes: The requested relations.
+        shape: Floor, doors and windows.
+        classes: Names of the classes by index.
+    """
+
+    def __init__(self, wishes: Sequence[RelationWish], shape: RoomShape, classes: Sequence[str]):
+        self.wishes, self.shape, self.classes = wishes, shape, classes
+        self.openings = {kind: opening_items(shape, kind) for kind in OPENINGS}
+
+    def held(self, furniture: Furniture) -> list[bool]:
+        """True for each relation that holds in a furnished room."""
+        return [int(self._met(wish, furniture).sum()) >= wish.count for wish in self.wishes]
+
+    def can_hold(
+        self, label: int, candidates: Furniture, placed: Furniture, upcoming: Sequence[int]
+    ) -> Bool[np.ndarray, " candidates"]:
+        """True for places of the next object, of class `label`, after which every relation is still
+        possible. Upcoming objects are assumed to find places in which their relations hold."""
+        possible = np.ones(len(candidates.back), dtype=bool)
+        name = self.classes[label]
+        for wish in self.wishes:
+            if name not in (wish.subject, wish.target):
+                continue
+            later = [self.classes[index] for index in upcoming]
+            if wish.target in later:
+                continue
+            needed = wish.count - later.count(wish.subject)
+            for row in np.flatnonzero(possible):
+                joined = placed.joined(candidates.rows(slice(row, row + 1)))
+                possible[row] = self._met(wish, joined).sum() >= needed
+        return possible
+
+    def _met(self, wish: RelationWish, furniture: Furniture) -> Bool[np.ndarray, " subjects"]:
+        """True for each object of the subject's class for which the relation holds."""
+        own = np.flatnonzero(furniture.object_class == self._index(wish.subject))
+        subjects = furniture.rows(own)
+        if wish.target is None:
+            return related_to_room(wish.relation, subjects, self.shape.floor)
+        if wish.target in OPENINGS:
+            to: Literal["window"] | None = "window" if wish.target == "window" else None
+            found = related(wish.relation, subjects, self.openings[wish.target], to)
+        else:
+            theirs = np.flatnonzero(furniture.object_class == self._index(wish.target))
+            lamps: Literal["lamp"] | None = "lamp" if "lamp" in wish.target else None
+            found = related(wish.relation, subjects, furniture.rows(theirs), lamps)
+            found &= own[:, None] != theirs[None]
+        return np.asarray(found.any(axis=1))
+
+    def _index(self, name: str) -> int:
+        """Index of a class; that of no object for other names."""
+        return self.classes.index(name) if name in self.classes else -2

@@ -3,38 +3,233 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from functools import cached_property
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    PlainValidator,
+    ValidationError,
+    model_validator,
+)
 
+from sceneprior.core.checked import shown
+from sceneprior.core.classes import label_set as label_set_of
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Opening, SceneObject
-from sceneprior.core.scene_json import check_box, unit_guess
-from sceneprior.lifted.requests.openings import Openings, WantedOpening, moved, read_openings
-from sceneprior.lifted.requests.relations import OPENINGS
+from sceneprior.core.scene_json import MOST_OBJECTS, ObjectEntry, check_box, read_object, unit_guess
+from sceneprior.lifted.requests.floors import Floor, read_floor
+from sceneprior.lifted.requests.openings import WantedOpening, moved, read_openings
 from sceneprior.lifted.requests.sentence import read_sentence
-from sceneprior.lifted.requests.shape import read_floor
-from sceneprior.lifted.requests.wishes import (
-    CountWish,
-    RelationWish,
-    Wishes,
-    count_wish,
-    counts_of_text,
-    relation_wish,
-)
+from sceneprior.lifted.requests.wishes import OPENINGS, Wishes, counts_of_text, read_wishes
 
 HIGHEST_M = 20.0
 """Highest ceiling that can be requested."""
-Floor = str | Sequence[Any] | np.ndarray
-Want = str | Mapping[str, Any]
+
+
+def _plain(value: Any) -> Any:
+    """Convert a part of a request to plain JSON data."""
+    if isinstance(value, Opening):
+        return _plain(value._asdict())
+    if isinstance(value, Mapping):
+        return {str(key): _plain(each) for key, each in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [_plain(each) for each in value]
+    return value if isinstance(value, str | float | int | bool | None) else str(value)
+
+
+def _read_objects(objects: Any) -> tuple[SceneObject, ...]:
+    """Given objects, from Python or as entries of a scene's JSON."""
+    if not isinstance(objects, Sequence) or len(objects) > MOST_OBJECTS:
+        raise InputError(
+            f"The objects are {shown(objects)}; expected a list, at most {MOST_OBJECTS} long."
+        )
+    found = [
+        each
+        if isinstance(each, SceneObject)
+        else read_object("The request", ObjectEntry.model_validate(each))
+        for each in objects
+    ]
+    for item in found:
+        check_box("The request", item.label, item.center_m, item.size_m)
+    return tuple(found)
+
+
+_Floor = Annotated[
+    Any, PlainValidator(_plain, json_schema_input_type=str | list[tuple[float, float]] | None)
+]
+_Openings = Annotated[
+    Any, PlainValidator(_plain, json_schema_input_type=str | list[dict[str, Any] | str] | None)
+]
+_Want = Annotated[
+    Any,
+    PlainValidator(
+        _plain,
+        json_schema_input_type=str
+        | dict[str, int | str | list[dict[str, str | int | None]]]
+        | None,
+    ),
+]
+_Objects = Annotated[
+    tuple[SceneObject, ...],
+    PlainValidator(_read_objects, json_schema_input_type=list[ObjectEntry]),
+]
+
+
+class RoomRequest(BaseModel):
+    """A request as users write it: in Python, as options, in the browser or in a file.
+
+    The parts are kept as they were written; what they say is read once, when the request is made.
+    `conditions` completes this by what a prior knows.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
+
+    floor: _Floor = None
+    """`4x3` (metres along x and z), or corners [x, z] in order; see `read_floor`."""
+    openings: _Openings = None
+    """Doors and windows, such as `door,window@north`; see `read_openings`."""
+    ceiling_m: Annotated[float, Field(strict=True)] | None = None
+    """Height of the ceiling."""
+    want: _Want = None
+    """Wishes: a sentence (`read_sentence`), a mapping (`read_wishes`), or numbers of objects by
+    class as text (`counts_of_text`)."""
+    objects: _Objects = ()
+    """Given objects, in the coordinates of the floor; they stay as they are."""
+
+    @classmethod
+    def of(cls, where: str | None = None, /, **parts: Any) -> "RoomRequest":
+        """Make a request from its parts.
+
+        Args:
+            where: File of the parts, for messages.
+
+        Raises:
+            InputError: a part is invalid; the message says what was expected.
+        """
+        try:
+            return cls(**parts)
+        except ValidationError as error:
+            (first, *_) = error.errors(include_url=False)
+            if isinstance(found := first.get("ctx", {}).get("error"), InputError):
+                if where is None:
+                    raise found from None
+                raise InputError(f"{where}: {str(found).removeprefix('The request: ')}") from None
+            start = (
+                "The request"
+                if where is None
+                else f"{where} is not a request, which docs/requests.md describes"
+            )
+            key, reason = ".".join(map(str, first["loc"])), first["msg"]
+            raise InputError(
+                f"{start}: {key} is {shown(first['input'])}; {reason[:1].lower()}{reason[1:]}."
+            ) from None
+
+    @model_validator(mode="after")
+    def _read(self) -> "RoomRequest":
+        """Read all parts that need no prior, so that mistakes are found at once."""
+        _ = self.outline_m, self.wanted_openings, self.wishes
+        if self.outline_m is None and any(isinstance(e, Opening) for e in self.wanted_openings):
+            raise InputError(
+                "An opening has corners, which lie on the walls of a floor; give the floor, too, "
+                "or write door or window@north."
+            )
+        height_m = self.ceiling_m
+        if height_m is not None and not 1.0 <= height_m <= HIGHEST_M:
+            guess = f" {unit_guess(height_m)}" if height_m > HIGHEST_M else ""
+            raise InputError(
+                f"The ceiling is {height_m:g} m high; expected 1 to {HIGHEST_M:g} m above the "
+                f"floor.{guess}"
+            )
+        return self
+
+    @cached_property
+    def outline_m(self) -> np.ndarray | None:
+        """Corners (x, z) of the floor; None if it is left open."""
+        return None if self.floor is None else read_floor(self.floor)
+
+    @cached_property
+    def wanted_openings(self) -> tuple[Opening | WantedOpening, ...]:
+        """The doors and windows."""
+        return () if self.openings is None else read_openings(self.openings)
+
+    @cached_property
+    def wishes(self) -> Wishes | None:
+        """The wishes; None if they are a sentence, which is read by what a prior knows."""
+        want = self.want
+        if isinstance(want, str):
+            want = counts_of_text(want)
+            return None if want is None else read_wishes(want)
+        return Wishes() if want is None else read_wishes(want)
+
+    def parts(self) -> dict[str, Any]:
+        """The parts that are set, as arguments of `Prior.sample`."""
+        found = {name: getattr(self, name) for name in RoomRequest.model_fields}
+        return {name: part for name, part in found.items() if part not in (None, [], ())}
+
+    def conditions(self, known: Sequence[str], label_set: str) -> "Conditions":
+        """The request as a prior understands it.
+
+        Without given objects, the floor is moved so that the centre of its bounding box is the
+        origin. A door or a window to which a relation refers is added if there is none.
+
+        Args:
+            known: Classes that the prior draws.
+            label_set: Name of the prior's label set.
+
+        Raises:
+            InputError: the prior does not understand a part, or two parts contradict each other.
+        """
+        outline_m, openings, wishes = self.outline_m, self.wanted_openings, self.wishes
+        if wishes is None:
+            sentence = read_sentence(self.want, known, label_set)
+            if sentence.floor is not None:
+                if outline_m is not None:
+                    raise InputError(
+                        f"The floor is given, and the sentence asks for {sentence.floor} m; leave "
+                        "one out."
+                    )
+                outline_m = read_floor(sentence.floor)
+            openings += read_openings(sentence.openings)
+            wishes = sentence.wishes
+        targets = {wish.target for wish in wishes.relations}
+        for kind in OPENINGS:
+            if kind in targets and all(each.kind != kind for each in openings):
+                openings += read_openings(kind)
+        if outline_m is not None and not self.objects:
+            middle = (outline_m.min(axis=0) + outline_m.max(axis=0)) / 2
+            outline_m, openings = outline_m - middle, moved(openings, -middle)
+        classes = label_set_of(label_set)[1:]
+        for item in self.objects:
+            if item.label not in classes:
+                raise InputError(
+                    f"A given object is a '{item.label}', which this run does not know; its "
+                    f"classes are {', '.join(classes)}."
+                )
+        return Conditions(
+            None if outline_m is None else Floor(outline_m), openings, self.ceiling_m, wishes,
+            self.objects,
+        )  # fmt: skip
+
+
+class RequestFile(RoomRequest):
+    """The JSON of a request; `RequestFile.model_json_schema()` is its JSON Schema."""
+
+    format: Literal["sceneprior-request"]
+    version: Literal[1]
 
 
 @dataclass(frozen=True)
-class Request:
-    """Conditions that sampled rooms must meet, validated; lengths in metres."""
+class Conditions:
+    """What the rooms of a request must meet, as a prior understands it."""
 
-    outline_m: np.ndarray | None = None
-    """Corners (x, z) of the floor; with None, a rectangle is drawn for each room."""
+    floor: Floor | None = None
+    """None draws a rectangle for each room."""
     openings: tuple[Opening | WantedOpening, ...] = ()
     ceiling_m: float | None = None
     wishes: Wishes = field(default_factory=Wishes)
@@ -45,82 +240,3 @@ class Request:
     def given(self) -> Counter[str]:
         """Number of given objects of each class."""
         return Counter(item.label for item in self.objects)
-
-
-def make_request(
-    known: Sequence[str],
-    label_set: str,
-    floor: Floor | None = None,
-    openings: Openings | None = None,
-    ceiling_m: float | None = None,
-    want: Want | None = None,
-    objects: Sequence[SceneObject] = (),
-) -> Request:
-    """Validate the parts of a request, and put them together.
-
-    Args:
-        known: Classes that the prior draws.
-        label_set: Name of the prior's label set.
-        floor: See `read_floor`. Unless there are objects, the floor is moved so that the centre of
-            its bounding box is the origin.
-        openings: Doors and windows; see `read_openings`.
-        ceiling_m: Height of the ceiling.
-        want: A sentence (`read_sentence`), a mapping (`read_wishes`), or numbers of objects by
-            class as text (`counts_of_text`).
-        objects: Given objects, in the coordinates of the floor.
-
-    Raises:
-        InputError: a part is invalid, or contradicts another.
-    """
-    placed = () if openings is None else read_openings(openings)
-    if isinstance(want, str) and (counts := counts_of_text(want)) is not None:
-        want = counts
-    if isinstance(want, str):
-        sentence = read_sentence(want, known, label_set)
-        if floor is not None and sentence.floor is not None:
-            raise InputError(
-                f"The floor is given, and the sentence asks for {sentence.floor} m; leave one out."
-            )
-        floor = sentence.floor if floor is None else floor
-        placed += read_openings(sentence.openings)
-        wishes = sentence.wishes
-    else:
-        wishes = Wishes() if want is None else read_wishes(want)
-    for item in objects:
-        check_box("The request", item.label, item.center_m, item.size_m)
-    targets = {wish.target for wish in wishes.relations}
-    for kind in OPENINGS:  # a relation to a door or a window needs such an opening
-        if kind in targets and all(each.kind != kind for each in placed):
-            placed += read_openings(kind)
-    outline_m = None if floor is None else read_floor(floor)
-    if outline_m is not None and not objects:
-        middle = (outline_m.min(axis=0) + outline_m.max(axis=0)) / 2
-        outline_m, placed = outline_m - middle, moved(placed, -middle)
-    if outline_m is None and any(isinstance(each, Opening) for each in placed):
-        raise InputError(
-            "An opening has corners, which lie on the walls of a floor; give the floor, too, or "
-            "write door or window@north."
-        )
-    if ceiling_m is not None and not 1.0 <= ceiling_m <= HIGHEST_M:
-        guess = f" {unit_guess(ceiling_m)}" if ceiling_m > HIGHEST_M else ""
-        raise InputError(
-            f"The ceiling is {ceiling_m:g} m high; expected 1 to {HIGHEST_M:g} m above the floor."
-            f"{guess}"
-        )
-    return Request(outline_m, placed, ceiling_m, wishes, tuple(objects))
-
-
-def read_wishes(want: Mapping[str, Any]) -> Wishes:
-    """Wishes from a mapping of classes to numbers, with relations under the key `relations`.
-
-    >>> [str(wish) for wish in read_wishes({"nightstand": 2, "desk": "<=1"}).counts]
-    ['2 nightstand', 'at most 1 desk']
-    """
-    counts: list[CountWish] = []
-    relations: list[RelationWish] = []
-    for key, value in want.items():
-        if key == "relations":
-            relations += [relation_wish(entry) for entry in value]
-        else:
-            counts.append(count_wish(key, value))
-    return Wishes(tuple(counts), tuple(relations))

@@ -10,8 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from sceneprior.core.errors import InputError
-from sceneprior.lifted.requests.wishes import CountWish, RelationWish, Wishes
-from sceneprior.lifted.requests.words import (
+from sceneprior.lifted.requests.vocabulary import (
     ARTICLES,
     BEFORE_ROOMS,
     BOUNDS,
@@ -24,6 +23,7 @@ from sceneprior.lifted.requests.words import (
     ROOMS,
     WALLS,
 )
+from sceneprior.lifted.requests.wishes import CountWish, RelationWish, Wishes
 
 LONGEST = 2000
 """Maximum number of characters of a sentence."""

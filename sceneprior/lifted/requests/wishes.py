@@ -5,10 +5,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from sceneprior.core.checked import shown
 from sceneprior.core.classes import unknown_class
 from sceneprior.core.errors import InputError
-from sceneprior.lifted.requests.relations import OPENINGS, RELATIONS, TO_ROOM
 
+TO_ROOM = ("at a wall", "in a corner")
+"""Relations to the room, which have no target."""
+TO_TARGET = ("beside", "in front of", "facing", "under", "near", "far from")
+"""Relations to another object, a door or a window."""
+RELATIONS = (*TO_TARGET, *TO_ROOM)
+OPENINGS = ("door", "window")
+"""Targets that are not furniture."""
 _COUNT = re.compile(r"\s*(>=|<=|=|)\s*(\d+)\s*")
 _ENTRY = re.compile(r"(\w+)\s*:\s*(\S.*)")
 
@@ -186,3 +193,25 @@ def check_wishes(wishes: Wishes, known: Sequence[str], given: Mapping[str, int],
             f"The wishes need {total} objects, but rooms of this run hold at most {most} "
             "(model.max_objects); ask for fewer."
         )
+
+
+def read_wishes(want: Any) -> Wishes:
+    """Wishes from a mapping of classes to numbers, with relations under the key `relations`.
+
+    >>> [str(wish) for wish in read_wishes({"nightstand": 2, "desk": "<=1"}).counts]
+    ['2 nightstand', 'at most 1 desk']
+
+    Raises:
+        InputError: a wish has another form.
+    """
+    relations = want.get("relations", []) if isinstance(want, Mapping) else None
+    if not isinstance(relations, Sequence) or not all(isinstance(e, Mapping) for e in relations):
+        raise InputError(
+            f"The wishes are {shown(want)}; expected a sentence, or numbers of objects by class "
+            "and a list `relations`."
+        )
+    numbers = {key: value for key, value in want.items() if key != "relations"}
+    return Wishes(
+        tuple(count_wish(key, value) for key, value in numbers.items()),
+        tuple(relation_wish(entry) for entry in relations),
+    )

@@ -6,11 +6,8 @@ import shapely
 
 import sceneprior
 from sceneprior.apps.sample import sample_rooms
-from sceneprior.core.errors import InputError, InputWarning
+from sceneprior.core.errors import InputWarning
 from sceneprior.core.scene import Scene
-from sceneprior.lifted.requests.placement_rules import backed_by_walls
-from sceneprior.lifted.requests.relation_checks import Furniture
-from sceneprior.lifted.requests.shape import RoomShape, read_floor
 from sceneprior.lifted.sampled import scene_of
 from sceneprior.lifted.sampler.draw import draw_rooms
 
@@ -107,36 +104,6 @@ def test_nothing_reaches_through_the_ceiling_and_lamps_hang_from_it(prior):
         tops = room.centers_m[:, 1] + room.sizes_m[:, 1] / 2
         assert room.ceiling_m == 2.2 and tops.max() <= 2.211
         assert tops[labels(room).index("ceiling_lamp")] == pytest.approx(2.2, abs=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("request_", "message"),
-    [
-        ({"floor": "3x2", "want": {"double_bed": 4}}, r"cover .* square metres at their smallest"),
-        (
-            {"floor": "0.6x6", "want": {"double_bed": 1}},
-            "No room holds the request: in 8 attempts .* double bed found no place; most places "
-            "lacked free floor",
-        ),
-        ({"want": {"piano": 1}}, "'piano' is not a class of this run's training rooms"),
-        (
-            {"floor": "4x3", "distribution": "paper"},
-            "Requests for floors and wishes need a sampler",
-        ),
-    ],
-)
-def test_impossible_requests_are_a_sentence(prior, request_, message):
-    with pytest.raises(InputError, match=message):
-        prior.sample(1, **request_)
-
-
-def test_backs_at_the_inner_side_of_an_l_are_no_backs_at_walls():
-    """A box at z = 3 of the lower arm: where the upper arm goes on, there is no wall."""
-    shape = RoomShape(read_floor(L_SHAPE))
-    arm = np.array([[2.5, 1.5, 5.0, 3.0]] * 3)
-    boxes = np.array([[1.0, 0.5, 2.5, 1, 1, 1], [4.0, 0.5, 2.5, 1, 1, 1], [1.0, 0.5, 1.5, 1, 1, 1]])
-    at_high_z = Furniture(boxes, np.array([1, 1, 1]), np.array([2, 2, 2]), np.zeros(3, int))
-    assert backed_by_walls(shape, at_high_z, arm).tolist() == [False, True, True]
 
 
 def test_where_floor_is_scarce_beds_stand_on_it_and_keep_their_size(prior):

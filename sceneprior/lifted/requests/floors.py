@@ -1,16 +1,16 @@
-"""The shape of a requested room: the outline of its floor, and the rectangles that fit into it."""
+"""The floor of a requested room: its outline as users give it, and the rectangles in it."""
 
 import re
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
 from jaxtyping import Float
 
 from sceneprior.core.errors import InputError
-from sceneprior.core.outline import rectangle
+from sceneprior.core.outline import Wall, nearest_wall, rectangle, walls_of
 from sceneprior.core.scene import Opening
 from sceneprior.core.scene_json import check_floor, unit_guess
 
@@ -31,24 +31,22 @@ _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)")
 _SIZE = re.compile(r"\s*(\d+\.?\d*|\.\d+)\s*(?:m\s*)?[xX×]\s*(\d+\.?\d*|\.\d+)\s*m?\s*")
 
 
-class RoomShape:
-    """A floor with its doors and windows, in metres (x, z); walls stand on the floor's sides.
+class Floor:
+    """The floor of a room, in metres (x, z); walls stand on its sides.
 
     Args:
-        outline_m: Corners of the floor.
-        openings: Doors and windows, each on one side of the outline.
-        ceiling_m: Height of the ceiling; None if unknown.
+        outline_m: Corners in order, in either direction.
     """
 
-    def __init__(
-        self,
-        outline_m: Float[np.ndarray, "corners 2"],
-        openings: Sequence[Opening] = (),
-        ceiling_m: float | None = None,
-    ):
-        self.outline_m, self.openings, self.ceiling_m = outline_m, tuple(openings), ceiling_m
+    def __init__(self, outline_m: Float[np.ndarray, "corners 2"]):
+        self.outline_m = outline_m
         self.polygon = shapely.Polygon(outline_m)
         shapely.prepare(self.polygon)
+
+    @cached_property
+    def walls(self) -> list[Wall]:
+        """The walls; wall 0 leads from corner 0 to corner 1."""
+        return walls_of(self.outline_m)
 
     @cached_property
     def rectangles_m(self) -> Float[np.ndarray, "rectangles 4"]:
@@ -63,9 +61,9 @@ class RoomShape:
         whole = (high_x - low_x) * (high_z - low_z)
         return bool(abs(whole - self.polygon.area) < 1e-6 * whole)
 
-    @property
+    @cached_property
     def rectangle_m(self) -> Float[np.ndarray, "4"]:
-        """The floor's bounding rectangle: centre x, z and extents x, z."""
+        """The bounding rectangle: centre x, z and extents x, z."""
         low_x, low_z, high_x, high_z = self.polygon.bounds
         return np.array(
             [(low_x + high_x) / 2, (low_z + high_z) / 2, high_x - low_x, high_z - low_z]
@@ -77,6 +75,19 @@ class RoomShape:
         drawn given these extents."""
         extents_m = self.rectangle_m[2:]
         return np.asarray(extents_m * np.sqrt(self.polygon.area / extents_m.prod()))
+
+
+class RoomShape(NamedTuple):
+    """A floor with its doors and windows, and the height of the ceiling, if known."""
+
+    floor: Floor
+    openings: tuple[Opening, ...] = ()
+    ceiling_m: float | None = None
+
+    def inward(self, opening: Opening) -> Float[np.ndarray, "2"]:
+        """Unit normal, into the room, of the wall with this door or window."""
+        middle = np.mean([opening.start_m, opening.end_m], axis=0)
+        return self.floor.walls[nearest_wall(self.floor.walls, middle)].inward
 
 
 def read_floor(floor: str | Sequence[Any] | np.ndarray) -> np.ndarray:
@@ -142,7 +153,7 @@ def _floor_of_text(text: str) -> np.ndarray:
 
 
 def inner_rectangles(polygon: shapely.Polygon) -> Float[np.ndarray, "rectangles 4"]:
-    """The rectangles of `RoomShape.rectangles_m`. Their sides lie at corners of the floor or, for
+    """The rectangles of `Floor.rectangles_m`. Their sides lie at corners of the floor or, for
     floors with slanted sides, at points every `SPACING_M` along the outline."""
     corners = np.array(polygon.exterior.coords)
     if (np.abs(np.diff(corners, axis=0)).min(axis=1) >= 1e-3).any():  # a slanted side

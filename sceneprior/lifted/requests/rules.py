@@ -5,13 +5,11 @@ from collections.abc import Sequence
 
 import numpy as np
 import shapely
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
+from sceneprior.lifted.requests.floors import RoomShape
 from sceneprior.lifted.requests.openings import zones_of
-from sceneprior.lifted.requests.paths import Paths, needs_access
-from sceneprior.lifted.requests.relation_checks import Furniture, RelationChecks
-from sceneprior.lifted.requests.relations import OUTWARD, footprints
-from sceneprior.lifted.requests.shape import RoomShape
+from sceneprior.lifted.requests.relations import OUTWARD, Furniture, RelationChecks, footprints
 from sceneprior.lifted.requests.wishes import RelationWish
 
 FLUSH_M = 0.15
@@ -19,6 +17,18 @@ FLUSH_M = 0.15
 counts as standing with its back to this side."""
 WALL_M = 0.3
 """Maximum distance of the middle of such a back from a wall."""
+PATH_M = 0.6
+"""Width of a path."""
+CELL_M = 0.05
+"""Edge length of the cells of the grid on which paths are found."""
+HEAD_M = 1.8
+"""Objects whose bottom is higher than this are no obstacles."""
+FLAT_M = 0.05
+"""Objects up to this height, such as rugs, are no obstacles."""
+ARM_M = 0.1
+"""Largest gap between a path and an object that it reaches."""
+FLOOR_M = 0.3
+"""Largest height of the bottom of objects that must be reached, which are those on the floor."""
 BEFORE_WINDOWS = ("lamp", "plant")
 """Words in the names of classes that may stand or hang in front of a window."""
 
@@ -123,11 +133,75 @@ def backed_by_walls(
 ) -> Bool[np.ndarray, " candidates"]:
     """False for places whose back is at a side of their rectangle but not at a wall: in an L-shaped
     floor, some sides of rectangles are not walls."""
-    if shape.is_rectangle:
+    if shape.floor.is_rectangle:
         return np.ones(len(candidates.back), dtype=bool)
     inward = -OUTWARD[candidates.back]
     middles_m = candidates.boxes_m[:, [0, 2]] - inward * candidates.boxes_m[:, [3, 5]] / 2
     sides_m = rectangles_m[:, :2] - inward * rectangles_m[:, 2:] / 2
     gaps_m = np.abs(((middles_m - sides_m) * inward).sum(axis=1))
-    at_wall = shapely.distance(shapely.points(middles_m), shape.polygon.exterior) <= WALL_M
+    at_wall = shapely.distance(shapely.points(middles_m), shape.floor.polygon.exterior) <= WALL_M
     return np.asarray((gaps_m > FLUSH_M) | at_wall)
+
+
+class Paths:
+    """Grid of the points where the middle of a path of width `PATH_M` may lie.
+
+    Args:
+        shape: A room. In a room without doors, every object counts as reached.
+    """
+
+    def __init__(self, shape: RoomShape):
+        low_x, low_z, high_x, high_z = shape.floor.polygon.bounds
+        self.low_m = np.array([low_x, low_z])
+        x, z = (np.arange(a + CELL_M / 2, b, CELL_M) for a, b in ((low_x, high_x), (low_z, high_z)))
+        # A little less than half of the path, since cells are sampled at their centres.
+        inner = shape.floor.polygon.buffer(-PATH_M / 2 + CELL_M / 2 - 1e-6, join_style="mitre")
+        shapely.prepare(inner)
+        self.floor: Bool[np.ndarray, "x z"] = shapely.contains_xy(inner, x[:, None], z[None])
+        self.starts: list[Int[np.ndarray, 2]] = []
+        for each in shape.openings:
+            if each.kind == "door":
+                middle = np.mean([each.start_m, each.end_m], axis=0)
+                inside = middle + (PATH_M / 2 + CELL_M / 2) * shape.inward(each)
+                self.starts.append(((inside - self.low_m) / CELL_M).astype(int))
+
+    def reached(
+        self, boxes_m: Float[np.ndarray, "objects 6"], needs_access: Bool[np.ndarray, " objects"]
+    ) -> Bool[np.ndarray, " objects"]:
+        """True for objects to which paths lead from all doors, with all boxes as obstacles, and for
+        objects that need no path.
+
+        Args:
+            needs_access: True for objects that must be reached if they stand on the floor.
+        """
+        bottoms = boxes_m[:, 1] - boxes_m[:, 4] / 2
+        needed = needs_access & (bottoms <= FLOOR_M) & (boxes_m[:, 4] > FLAT_M)
+        found = np.ones(len(boxes_m), dtype=bool)
+        if not self.starts or not needed.any():
+            return found
+        from scipy import ndimage
+
+        free = self.floor.copy()
+        obstacles = (bottoms < HEAD_M) & (boxes_m[:, 4] > FLAT_M)
+        for row in np.flatnonzero(obstacles):
+            free[self._cells(boxes_m[row], PATH_M / 2 - CELL_M / 2)] = False
+        areas, _ = ndimage.label(free)
+        for x, z in self.starts:
+            area = areas[max(x - 2, 0) : x + 3, max(z - 2, 0) : z + 3]
+            own = np.unique(area[area > 0])
+            walked = np.isin(areas, own)
+            for row in np.flatnonzero(needed & found):
+                found[row] = walked[self._cells(boxes_m[row], PATH_M / 2 + ARM_M)].any()
+        return found
+
+    def _cells(self, box_m: Float[np.ndarray, "6"], margin_m: float) -> tuple[slice, slice]:
+        """The cells of a footprint, with a margin around it."""
+        half = box_m[[3, 5]] / 2 + margin_m
+        low = np.round((box_m[[0, 2]] - half - self.low_m) / CELL_M).astype(int).clip(min=0)
+        high = np.round((box_m[[0, 2]] + half - self.low_m) / CELL_M).astype(int).clip(min=0)
+        return slice(low[0], high[0]), slice(low[1], high[1])
+
+
+def needs_access(labels: Sequence[str]) -> Bool[np.ndarray, " labels"]:
+    """True for classes that must be reachable: all but lamps and plants."""
+    return np.array([not any(word in label for word in ("lamp", "plant")) for label in labels])

@@ -1,14 +1,15 @@
-"""Paths from doors to furniture, compared with a walk from cell to cell."""
+"""Placement rules: walls behind backs, and paths, compared with a walk from cell to cell."""
 
 import numpy as np
 import pytest
 
 from sceneprior.core.scene import Opening
-from sceneprior.lifted.requests.paths import CELL_M, PATH_M, Paths, needs_access
-from sceneprior.lifted.requests.shape import RoomShape, read_floor
+from sceneprior.lifted.requests.floors import Floor, RoomShape, read_floor
+from sceneprior.lifted.requests.relations import Furniture
+from sceneprior.lifted.requests.rules import CELL_M, PATH_M, Paths, backed_by_walls, needs_access
 
 DOOR = Opening("door", (-0.45, -1.5), (0.45, -1.5), 0.0, 2.0)
-SHAPE = RoomShape(read_floor("4x3"), [DOOR])
+SHAPE = RoomShape(Floor(read_floor("4x3")), (DOOR,))
 
 
 def box(x: float, z: float, width: float, depth: float, bottom: float = 0.0) -> list[float]:
@@ -39,7 +40,7 @@ def test_lamps_need_no_way_and_rooms_without_doors_none_at_all():
     desk, barrier = box(0, 1.2, 1, 0.5), box(0, 0.3, 4, 0.3)
     found = Paths(SHAPE).reached(np.array([desk, barrier]), np.array([False, True]))
     assert found.tolist() == [True, True]
-    assert reached(desk, barrier, shape=RoomShape(read_floor("4x3"))) == [True, True]
+    assert reached(desk, barrier, shape=RoomShape(Floor(read_floor("4x3")))) == [True, True]
     assert needs_access(["desk", "floor_lamp", "plant"]).tolist() == [True, False, False]
 
 
@@ -85,3 +86,13 @@ def walked_to(boxes: np.ndarray) -> list[bool]:
                 walk.append(cell)
     wide = PATH_M / 2 + 0.1
     return [any(blocked(i, j, wide, row) for i, j in walked) for row in boxes]
+
+
+def test_backs_at_the_inner_side_of_an_l_are_no_backs_at_walls():
+    """A box at z = 3 of the lower arm: where the upper arm goes on, there is no wall."""
+    outline = [[0, 0], [5, 0], [5, 3], [2.5, 3], [2.5, 6], [0, 6]]
+    shape = RoomShape(Floor(read_floor(outline)))
+    arm = np.array([[2.5, 1.5, 5.0, 3.0]] * 3)
+    boxes = np.array([[1.0, 0.5, 2.5, 1, 1, 1], [4.0, 0.5, 2.5, 1, 1, 1], [1.0, 0.5, 1.5, 1, 1, 1]])
+    at_high_z = Furniture(boxes, np.array([1, 1, 1]), np.array([2, 2, 2]), np.zeros((3, 2)))
+    assert backed_by_walls(shape, at_high_z, arm).tolist() == [False, True, True]
