@@ -148,7 +148,10 @@ def sampler_run(toy_shards: Path, made_once: Callable[..., Path]) -> Path:
 @pytest.fixture
 def few_attempts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Samplers give up on a room early: an untrained one finds places for its furniture late."""
-    monkeypatch.setattr("sceneprior.lifted.sampler.draw.ROUNDS", 2)
+    from sceneprior.lifted.drawing import draw
+
+    few = draw.PLAIN._replace(attempts=6, attempts_per_plan=2, whole=5)
+    monkeypatch.setattr(draw, "PLAIN", few)
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ from torch import Tensor
 from sceneprior import __version__
 from sceneprior.apps.config import load_any_run, weights_of, with_latents
 from sceneprior.apps.priors.packed import name_of, version_of
+from sceneprior.apps.requests import request_of
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
@@ -142,27 +143,9 @@ class Prior:
             "floor": floor, "openings": openings, "ceiling_m": ceiling_m, "want": want,
             "objects": objects,
         }  # fmt: skip
-        asked = {key: value for key, value in asked.items() if value is not None}
-        if asked:
-            rooms = self._requested(asked, count, seed, distribution)
-        else:
-            rooms = sample_rooms(self.trained, count, seed, distribution)
+        rooms = sample_rooms(self.trained, count, seed, distribution, request_of(asked))
         rooms = self._told(rooms, seed=seed, distribution=distribution or self.distribution)
         return _with_models(rooms, objects or ()) if cad else rooms
-
-    def _requested(
-        self,
-        asked: dict[str, Any],
-        count: int,
-        seed: int,
-        distribution: str | None,
-        name: str | None = None,
-    ) -> list[Scene]:
-        from sceneprior.apps.requests import with_floor_of_file
-        from sceneprior.lifted.requests.answers import sample_requested
-
-        asked = with_floor_of_file(asked)
-        return sample_requested(self.with_latents, asked, count, seed, distribution, name)
 
     def interpolate(self, start: Point, end: Point, steps: int = 9) -> list[Scene]:
         """Rooms on the geodesic between two latents, both ends included.
@@ -228,18 +211,12 @@ class Prior:
                 "`classes` lists the classes to add, but the request also has "
                 f"{', '.join(sorted(asked))}; name the classes in its wishes (want) instead."
             )
-        if asked or (classes is None and _has_walls(scene)):
-            own: dict[str, Any] = {"objects": scene.objects}
-            if floor is None:
-                own |= {"floor": scene.floor_m, "openings": scene.openings or None}
-                own |= {"ceiling_m": scene.ceiling_m}
-            own = {key: value for key, value in own.items() if value is not None}
-            rooms = self._requested({**own, **asked}, count, seed, distribution, "complete")
-        else:
-            from sceneprior.lifted.complete import complete
-
-            trained = self.with_latents
-            rooms = complete(trained, [scene], count, seed, distribution, classes=classes)[0]
+        own: dict[str, Any] = {"objects": scene.objects}
+        if floor is None:
+            own |= {"floor": scene.floor_m, "openings": scene.openings or None}
+            own |= {"ceiling_m": scene.ceiling_m}
+        request = request_of({**own, **asked})
+        rooms = sample_rooms(self.trained, count, seed, distribution, request, "complete", classes)
         rooms = self._told(rooms, seed=seed)
         return _with_models(rooms, scene.objects) if cad else rooms
 
@@ -302,14 +279,3 @@ def _with_models(rooms: list[Scene], given: Sequence[SceneObject]) -> list[Scene
     from sceneprior.apps.retrieval.retrieve import with_models
 
     return with_models(rooms, given)
-
-
-def _has_walls(scene: Scene) -> bool:
-    """True if a room has openings, a ceiling, or a floor that is not a rectangle."""
-    if scene.openings or scene.ceiling_m is not None:
-        return True
-    if scene.floor_m is None:
-        return False
-    from sceneprior.lifted.requests.floors import Floor
-
-    return not Floor(scene.floor_m).is_rectangle

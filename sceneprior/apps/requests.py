@@ -1,12 +1,12 @@
 """Read requests from JSON, and requested floors from files of other programs."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
-from sceneprior.interchange.floors import read_floor_file
-from sceneprior.lifted.requests.request import RequestFile
+from sceneprior.lifted.requests.request import RequestFile, RoomRequest
 
 
 def load_request(path: str | Path) -> dict[str, Any]:
@@ -23,6 +23,16 @@ def load_request(path: str | Path) -> dict[str, Any]:
     return RequestFile.of(str(path), **data).parts()
 
 
+def request_of(asked: Mapping[str, Any]) -> RoomRequest | None:
+    """The request of these parts, of which None is left out; None if there is no part.
+
+    Raises:
+        InputError: a part is invalid.
+    """
+    asked = with_floor_of_file({key: part for key, part in asked.items() if part is not None})
+    return RoomRequest.of(**asked) if asked else None
+
+
 def with_floor_of_file(asked: dict[str, Any]) -> dict[str, Any]:
     """Replace a file name given as the floor of a request by the floor in that file. Doors, windows
     and ceiling are also taken from the file, unless the request has its own.
@@ -33,6 +43,8 @@ def with_floor_of_file(asked: dict[str, Any]) -> dict[str, Any]:
     floor = asked.get("floor")
     if not isinstance(floor, str | Path) or not (isinstance(floor, Path) or _is_file(floor)):
         return asked
+    from sceneprior.interchange.floors import read_floor_file  # imported here: files only
+
     found = read_floor_file(str(floor))
     own: dict[str, Any] = {"floor": found.outline_m}
     if asked.get("openings") is None:

@@ -7,7 +7,8 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.repeatable import check_seed, single_threaded
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.views import RoomBoxes
-from sceneprior.lifted.sampled import drawn_by_sampler, sample_scenes
+from sceneprior.lifted.drawing.scenes import drawn_by_sampler, sample_scenes
+from sceneprior.lifted.requests.request import RoomRequest
 from sceneprior.paper.decode import decode_latents
 from sceneprior.paper.prior import TrainedPrior
 from sceneprior.paper.sampling import draw_latents, scene_names
@@ -16,11 +17,25 @@ from sceneprior.training.method import Trained, TrainedReconstructor
 
 @single_threaded()
 def sample_rooms(
-    trained: Trained, count: int, seed: int, distribution: str | None = None
+    trained: Trained,
+    count: int,
+    seed: int,
+    distribution: str | None = None,
+    request: RoomRequest | None = None,
+    prefix: str | None = None,
+    classes: Sequence[str] | None = None,
 ) -> list[Scene]:
     """Sample new rooms from a run of any method, by its sampler or a distribution of latents.
 
     The same seed gives the same rooms; without a distribution, the run's default is used.
+
+    Args:
+        request: What the rooms must meet; only a sampler can.
+        prefix: Start of the rooms' names; by default, they are named by the seed.
+        classes: See `sample_scenes`.
+
+    Raises:
+        InputError: the run cannot draw such rooms.
     """
     if isinstance(trained, TrainedReconstructor):
         raise InputError(
@@ -29,9 +44,17 @@ def sample_rooms(
         )
     check_seed(seed)
     names = scene_names(count, seed)
+    if prefix is not None:
+        names = [f"{prefix}_{row:02d}" for row in range(count)]
+    own = drawn_by_sampler(trained, distribution) if isinstance(trained, TrainedPrior) else None
+    if own is not None:
+        return sample_scenes(own, names, seed, request, classes)
+    if request is not None or classes is not None:
+        raise InputError(
+            "Floors, wishes and given objects need a sampler, but these rooms come from latents; "
+            "leave them out, or take a prior with a sampler."
+        )
     if isinstance(trained, TrainedPrior):
-        if (with_sampler := drawn_by_sampler(trained, distribution)) is not None:
-            return sample_scenes(with_sampler, names, seed)
         z, _ = draw_latents(trained, count, seed, distribution)
         return decode_latents(trained, z, names)
     if distribution is not None:

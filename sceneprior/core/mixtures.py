@@ -75,7 +75,7 @@ class LogisticMixture(NamedTuple):
         return self.drawn(choice.unsqueeze(-1), place.unsqueeze(-2))[..., 0, :]
 
 
-def draw_index(logits: Float[Tensor, "*batch choices"], uniform: Float[Tensor, "*batch"]) -> Tensor:
+def draw_index(logits: Float[Tensor, "*#n choices"], uniform: Float[Tensor, "*#n"]) -> Tensor:
     """Sample a categorical index by inverse transform of a uniform number in [0, 1)."""
     reached = logits.softmax(dim=-1).cumsum(dim=-1) <= uniform.unsqueeze(-1)
     return reached.sum(dim=-1).clamp(max=logits.shape[-1] - 1)

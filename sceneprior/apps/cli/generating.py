@@ -125,8 +125,7 @@ def complete(
     write_scenes(scenes, out, drawn)
     options.note_unmet(scenes)
     given_objects = f"{len(scene.objects)} given object{'s' * (len(scene.objects) != 1)}"
-    how = "drawn by the sampler" if scenes[0].latent is None else "decoded from fitted latents"
-    typer.echo(f"Wrote {options.rooms_in_words(count)} around {given_objects}, {how}, to {out}")
+    typer.echo(f"Wrote {options.rooms_in_words(count)} around {given_objects} to {out}")
     for room in scenes:
         if lacking := room.extra.get("no_place"):
             typer.echo(f"Note: {room.name} has no place for {', '.join(lacking)}.", err=True)

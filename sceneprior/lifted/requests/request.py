@@ -1,5 +1,6 @@
 """Requests for rooms: floor, doors and windows, ceiling, wishes and given objects."""
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -24,7 +25,13 @@ from sceneprior.core.scene_json import MOST_OBJECTS, ObjectEntry, check_box, rea
 from sceneprior.lifted.requests.floors import Floor, read_floor
 from sceneprior.lifted.requests.openings import WantedOpening, moved, read_openings
 from sceneprior.lifted.requests.sentence import read_sentence
-from sceneprior.lifted.requests.wishes import OPENINGS, Wishes, counts_of_text, read_wishes
+from sceneprior.lifted.requests.wishes import (
+    OPENINGS,
+    Wishes,
+    check_wishes,
+    counts_of_text,
+    read_wishes,
+)
 
 HIGHEST_M = 20.0
 """Highest ceiling that can be requested."""
@@ -172,7 +179,7 @@ class RoomRequest(BaseModel):
         found = {name: getattr(self, name) for name in RoomRequest.model_fields}
         return {name: part for name, part in found.items() if part not in (None, [], ())}
 
-    def conditions(self, known: Sequence[str], label_set: str) -> "Conditions":
+    def conditions(self, known: Sequence[str], label_set: str, most: int) -> "Conditions":
         """The request as a prior understands it.
 
         Without given objects, the floor is moved so that the centre of its bounding box is the
@@ -181,6 +188,7 @@ class RoomRequest(BaseModel):
         Args:
             known: Classes that the prior draws.
             label_set: Name of the prior's label set.
+            most: Largest number of objects in a room.
 
         Raises:
             InputError: the prior does not understand a part, or two parts contradict each other.
@@ -204,17 +212,17 @@ class RoomRequest(BaseModel):
         if outline_m is not None and not self.objects:
             middle = (outline_m.min(axis=0) + outline_m.max(axis=0)) / 2
             outline_m, openings = outline_m - middle, moved(openings, -middle)
-        classes = label_set_of(label_set)[1:]
+        classes = tuple(label_set_of(label_set))
         for item in self.objects:
-            if item.label not in classes:
+            if item.label not in classes[1:]:
                 raise InputError(
                     f"A given object is a '{item.label}', which this run does not know; its "
-                    f"classes are {', '.join(classes)}."
+                    f"classes are {', '.join(classes[1:])}."
                 )
-        return Conditions(
-            None if outline_m is None else Floor(outline_m), openings, self.ceiling_m, wishes,
-            self.objects,
-        )  # fmt: skip
+        floor = None if outline_m is None else Floor(outline_m)
+        found = Conditions(classes, floor, openings, self.ceiling_m, wishes, self.objects)
+        check_wishes(wishes, known, found.given, most)
+        return found
 
 
 class RequestFile(RoomRequest):
@@ -228,6 +236,8 @@ class RequestFile(RoomRequest):
 class Conditions:
     """What the rooms of a request must meet, as a prior understands it."""
 
+    classes: tuple[str, ...]
+    """Names of the prior's classes, `void` included."""
     floor: Floor | None = None
     """None draws a rectangle for each room."""
     openings: tuple[Opening | WantedOpening, ...] = ()
@@ -240,3 +250,29 @@ class Conditions:
     def given(self) -> Counter[str]:
         """Number of given objects of each class."""
         return Counter(item.label for item in self.objects)
+
+    @property
+    def required(self) -> list[int]:
+        """The class index of each object that the wishes require beyond the given ones."""
+        required = []
+        for label in self.wishes.labels:
+            missing = self.wishes.bounds(label)[0] - self.given[label]
+            required += [self.classes.index(label)] * max(0, missing)
+        return required
+
+    @property
+    def most(self) -> list[float]:
+        """Largest number of objects of each class."""
+        most = [math.inf] * len(self.classes)
+        for label in self.wishes.labels:
+            largest = self.wishes.bounds(label)[1]
+            if largest is not None:
+                most[self.classes.index(label)] = float(largest)
+        return most
+
+    @property
+    def has_rules(self) -> bool:
+        """True if there are conditions that the network does not know, so that places of objects
+        must be checked: openings, a ceiling, relations, or a floor that is not a rectangle."""
+        odd_floor = self.floor is not None and not self.floor.is_rectangle
+        return bool(self.openings or self.wishes.relations or self.ceiling_m or odd_floor)

@@ -190,8 +190,8 @@ def check_wishes(wishes: Wishes, known: Sequence[str], given: Mapping[str, int],
         total += max(least, here)
     if total > most:
         raise InputError(
-            f"The wishes need {total} objects, but rooms of this run hold at most {most} "
-            "(model.max_objects); ask for fewer."
+            f"The given and the requested objects are {total} together, but rooms of this run "
+            f"hold at most {most} (model.max_objects); ask for fewer."
         )
 
 

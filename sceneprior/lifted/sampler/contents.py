@@ -77,12 +77,19 @@ class Contents(nn.Module):
         free: Int[Tensor, " rooms"],
         extents_m: Float[Tensor, "rooms 2"],
         uniform: Float[Tensor, "rooms slots"],
+        most: Float[Tensor, " classes"] | None = None,
     ) -> Int[Tensor, "rooms slots"]:
         """Sample the classes to add to the given `counts`, at most `free` of them, followed by
-        `END`."""
+        `END`. Classes of which there are `most` already are left out.
+
+        The network was trained to continue any subset of a room's classes.
+        """
         going, drawn = torch.ones_like(free, dtype=torch.bool), torch.zeros_like(uniform).long()
         for slot, chance in enumerate(uniform.unbind(dim=1)):
-            label = draw_index(self(counts, extents_m), chance)
+            logits = self(counts, extents_m)
+            if most is not None:
+                logits = logits.masked_fill(counts >= most, -torch.inf)
+            label = draw_index(logits, chance)
             going = going & (label != END) & (slot < free)
             drawn[:, slot] = label * going
             counts = counts.scatter_add(1, label[:, None], going[:, None].to(counts))

@@ -144,7 +144,7 @@ def test_complete_adds_what_is_asked_for(command, sampler_run, tmp_path, few_att
     (tmp_path / "full.json").write_text(json.dumps(empty | {"objects": [bed], "floor_m": floor}))
     full = ["complete", "--given", "full.json", "-n", 1, "--classes", "double_bed"]
     status, out, errors = command(*full, "--run", sampler_run, "--out", "full")
-    assert status == 0 and out.startswith("Wrote 1 room around 1 given object,")
+    assert status == 0 and out.startswith("Wrote 1 room around 1 given object to")
     assert "Note: complete_00 has no place for double_bed." in errors
     room = json.loads((tmp_path / "full" / "complete_00.json").read_text())
     assert len(room["objects"]) == 1 and room["extra"]["no_place"] == ["double_bed"]

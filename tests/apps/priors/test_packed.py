@@ -28,7 +28,7 @@ from sceneprior.apps.priors.packed import (
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene, SceneObject
-from sceneprior.lifted.complete import complete
+from sceneprior.lifted.requests.request import RoomRequest
 from sceneprior.paper.interpolate import interpolate
 
 pytestmark = pytest.mark.usefixtures("few_attempts")
@@ -67,8 +67,8 @@ def assert_same(rooms: list[Scene], others: list[Scene]) -> None:
 def test_a_sampler_s_rooms_are_the_same_to_the_bit(sampler_run, sampler_file):
     trained, back = load_run(sampler_run), load_run(sampler_file)
     assert_same(sample_rooms(trained, 4, 3), sample_rooms(back, 4, 3))
-    given = Scene("mine", "front3d_bedroom", (BED,))
-    assert_same(*(complete(one, [given], count=2)[0] for one in (trained, back)))
+    given = RoomRequest(objects=[BED])
+    assert_same(*(sample_rooms(one, 2, 0, request=given) for one in (trained, back)))
     # The same point of the sphere, wherever it is drawn from.
     z = torch.randn(2, back.config.model.width, generator=torch.Generator().manual_seed(0))
     assert_same(*(interpolate(one, z[0], z[1], 3) for one in (trained, back)))

@@ -45,11 +45,11 @@ def test_wishes_that_fit_pass():
 
 def test_a_floor_is_moved_to_its_middle_unless_objects_stand_on_it():
     asked = {"floor": [[0, 0], [4, 0], [4, 2], [0, 2]]}
-    there = RoomRequest(**asked).conditions(KNOWN, LABELS).floor
+    there = RoomRequest(**asked).conditions(KNOWN, LABELS, 9).floor
     assert there is not None
     assert there.outline_m.tolist() == [[-2, -1], [2, -1], [2, 1], [-2, 1]]
     sofa = SceneObject("sofa", (1.0, 0.4, 1.0), (1.0, 0.8, 1.0))
-    there = RoomRequest(**asked, objects=[sofa]).conditions(KNOWN, LABELS).floor
+    there = RoomRequest(**asked, objects=[sofa]).conditions(KNOWN, LABELS, 9).floor
     assert there is not None and there.outline_m.tolist() == asked["floor"]
 
 
@@ -63,7 +63,7 @@ def test_counts_as_text_are_those_of_a_mapping():
 
 def test_a_relation_to_a_window_adds_the_window():
     want = {"relations": [{"subject": "desk", "relation": "under", "target": "window"}]}
-    (window,) = RoomRequest(want=want).conditions(KNOWN, LABELS).openings
+    (window,) = RoomRequest(want=want).conditions(KNOWN, LABELS, 9).openings
     assert window == WantedOpening("window")
 
 

@@ -11,7 +11,6 @@ from torch.testing import assert_close
 
 from sceneprior.lifted.prototypes import POSES
 from sceneprior.lifted.sampler import sizes as module
-from sceneprior.lifted.sampler.draw import draw_rooms
 from sceneprior.lifted.sampler.rooms import SamplerRooms, turned_rooms
 from sceneprior.lifted.sampler.sizes import COMMON, SAME_SIZE, SIZES, find_sizes
 
@@ -113,21 +112,6 @@ def test_sizes_are_drawn_as_often_as_they_occur_in_the_pose_of_the_look():
         drawn = sampler.draw_size(torch.full((400,), pose), uniform)
         wanted = sampler.sizes_m[0, [0] * 300 + [1] * 100]
         assert torch.equal(drawn, wanted.flip(-1) if pose % 2 else wanted)
-
-
-def test_drawn_rooms_hold_sizes_of_the_training_rooms_alone():
-    sampler = small_sampler(sampler_rooms())
-    sampler.bottoms_m.copy_(torch.rand(sampler.bottoms_m.shape) * sampler.size_counts.sign())
-    drawn = draw_rooms(sampler, 30, 0)
-    assert drawn.is_object.any()
-    for look, box_m in zip(
-        drawn.looks[drawn.is_object], drawn.boxes_m[drawn.is_object], strict=True
-    ):
-        size_m = box_m[3:]
-        own_m = size_m.flip(0) if look % 2 else size_m
-        same = (sampler.sizes_m[look // POSES] == own_m).all(dim=-1)
-        assert same.any()
-        assert_close(sampler.bottoms_m[look // POSES][same][0], box_m[1] - size_m[1] / 2)
 
 
 def test_the_height_is_that_of_the_most_similar_size():

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from sceneprior.lifted.sampler.plan import BEYOND_M
+from sceneprior.lifted.drawing.plans import BEYOND_M
 from sceneprior.lifted.sampler.reading import Reading
 from sceneprior.lifted.sampler.rooms import GRAZE_M, shared_extents
 
@@ -13,7 +13,7 @@ INTERSECTING = 0.01
 as in the evaluation."""
 
 
-def settled(
+def resolve_overlap(
     boxes_m: Float[Tensor, "rooms 6"], reading: Reading, apart: Bool[Tensor, "rooms objects"]
 ) -> Float[Tensor, "rooms 6"]:
     """Move boxes out of objects marked in `apart`, and into the rectangle, along each axis by at

@@ -1,11 +1,12 @@
-"""Scenes from a run's sampler: each object's look becomes a mesh in its box."""
+"""Scenes from a run's sampler: plain rooms, requested rooms, and the rest of given ones."""
 
+from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
-import torch
-from jaxtyping import Float, Int
-from torch import Tensor
+from jaxtyping import Float
 
 from sceneprior.core.classes import label_set, unknown_class
 from sceneprior.core.errors import InputError
@@ -13,13 +14,14 @@ from sceneprior.core.outline import rectangle
 from sceneprior.core.repeatable import single_threaded
 from sceneprior.core.scene import Mesh, Scene, SceneObject, Solid, quarter_turned
 from sceneprior.lifted.config import SAMPLER, TrainedLifted
+from sceneprior.lifted.drawing.draw import SampledRooms, draw_rooms
 from sceneprior.lifted.lifting import HANGS_M
 from sceneprior.lifted.prototype_decoder import PrototypeDecoder
 from sceneprior.lifted.prototypes import POSES
+from sceneprior.lifted.requests.relations import RelationChecks, furniture_in
+from sceneprior.lifted.requests.request import Conditions, RoomRequest
 from sceneprior.lifted.rooms import PosedRooms
-from sceneprior.lifted.sampler.draw import draw_rooms
 from sceneprior.lifted.sampler.frames import side_of
-from sceneprior.lifted.sampler.plan import Given
 from sceneprior.paper.prior import TrainedPrior
 
 
@@ -43,12 +45,87 @@ def drawn_by_sampler(trained: TrainedPrior, distribution: str | None) -> Trained
 
 @single_threaded()
 def sample_scenes(
-    trained: TrainedLifted, names: Sequence[str], seed: int, given: Given | None = None
+    trained: TrainedLifted,
+    names: Sequence[str],
+    seed: int,
+    request: RoomRequest | None = None,
+    classes: Sequence[str] | None = None,
 ) -> list[Scene]:
-    """Sample a room with meshes for each name; see `draw_rooms`."""
-    assert trained.sampler is not None, "callers ask trained.sampler first"
-    rooms = draw_rooms(trained.sampler, len(names), seed, given)
-    return [scene_of(trained, name, rooms, row) for row, name in enumerate(names)]
+    """Sample a room with meshes for each name; see `draw_rooms`.
+
+    `extra` of a room lists the rows of the given objects (`given`), the request without them
+    (`request`), and whether each wish holds (`wishes`).
+
+    Args:
+        classes: Classes of the objects to add to the given ones, and no others; instead of wishes.
+            `extra["no_place"]` lists those for which no place was found.
+
+    Raises:
+        InputError: the prior does not understand the request, or no room meets it.
+    """
+    sampler = trained.sampler
+    assert sampler is not None, "callers ask trained.sampler first"
+    request, label_names = request or RoomRequest(), label_set(trained.config.label_set)
+    known = [label_names[row] for row in sampler.drawn_classes]
+    if classes is not None:
+        for label in classes:
+            if label not in known:
+                raise unknown_class(label, known)
+        whole = Counter(classes) + Counter(item.label for item in request.objects)
+        want = {label: whole[label] for label in known}
+        request = RoomRequest(**{**request.parts(), "want": want})
+    conditions = request.conditions(known, trained.config.label_set, sampler.max_objects)
+    drawn = draw_rooms(sampler, conditions, len(names), seed, may_lack=classes is not None)
+    told = {key: part for key, part in request.parts().items() if key != "objects"}
+    scenes = []
+    for row, name in enumerate(names):
+        scene = scene_of(trained, name, drawn.rooms, row)
+        extra: dict[str, Any] = {}
+        if classes is not None:
+            extra["no_place"] = sorted(label_names[index] for index in drawn.missing[row])
+        elif told:
+            extra = {"request": told, "wishes": _wishes(trained, conditions, drawn, row)}
+        scenes.append(_as_requested(scene, conditions, drawn, row, extra))
+    return scenes
+
+
+def _wishes(
+    trained: TrainedLifted, conditions: Conditions, drawn: SampledRooms, row: int
+) -> list[dict[str, Any]]:
+    """Each wish, and whether it holds in a room."""
+    assert trained.sampler is not None
+    furniture = furniture_in(trained.sampler, drawn.rooms, row)
+    counts = Counter(conditions.classes[index] for index in furniture.object_class)
+    wishes = conditions.wishes
+    held = [wish.holds(counts[wish.label]) for wish in wishes.counts]
+    if (shape := drawn.shapes[row]) is not None:
+        held += RelationChecks(wishes.relations, shape, conditions.classes).held(furniture)
+    return [
+        {"wish": str(wish), "holds": holds}
+        for wish, holds in zip((*wishes.counts, *wishes.relations), held, strict=True)
+    ]
+
+
+def _as_requested(
+    scene: Scene, conditions: Conditions, drawn: SampledRooms, row: int, extra: dict[str, Any]
+) -> Scene:
+    """A scene with the given objects as they are; those without a mesh get that of their look."""
+    given = conditions.objects
+    if given:
+        extra["given"] = list(range(len(given)))
+    objects = tuple(
+        replace(own, mesh=looked.mesh, solids=looked.solids) if own.mesh is None else own
+        for own, looked in zip(given, scene.objects, strict=False)
+    )
+    scene = replace(scene, objects=objects + scene.objects[len(given) :], extra=extra)
+    if (shape := drawn.shapes[row]) is None:
+        return scene
+    return replace(
+        scene,
+        floor_m=shape.floor.outline_m,
+        openings=shape.openings,
+        ceiling_m=shape.ceiling_m,
+    )
 
 
 def scene_of(trained: TrainedLifted, name: str, rooms: PosedRooms, row: int) -> Scene:
@@ -100,25 +177,3 @@ def _shape_in(
         box_m = np.array([box_m[0], top - height / 2, box_m[2], box_m[3], height, box_m[5]])
         solids = shapes.solids(look, box_m)
     return shapes.mesh(look, box_m), solids
-
-
-def class_rows(trained: TrainedLifted, labels: Sequence[str]) -> Int[Tensor, "1 labels"]:
-    """Indices of named classes, as in `Given.coming`.
-
-    Raises:
-        InputError: a class is not in the training rooms.
-    """
-    assert trained.sampler is not None
-    classes = label_set(trained.config.label_set)
-    known = [classes[row] for row in trained.sampler.drawn_classes]
-    for label in labels:
-        if label not in known:
-            raise unknown_class(label, known)
-    return torch.tensor([[classes.index(label) for label in labels]], dtype=torch.int64)
-
-
-def floor_rectangle(scene: Scene) -> Float[Tensor, "1 4"]:
-    """The bounding rectangle of a scene's floor: centre x, z and extents x, z."""
-    assert scene.floor_m is not None
-    low, high = scene.floor_m.min(axis=0), scene.floor_m.max(axis=0)
-    return torch.from_numpy(np.concatenate([(low + high) / 2, high - low])[None]).float()

@@ -1,6 +1,6 @@
 """Rooms drawn by the shipped priors, with and without a request, are those of the golden file.
 
-A change of what is drawn replaces the file: `TAKE_DRAWN=1 pytest tests/lifted/test_drawn_golden.py`
+A change of what is drawn replaces the file: `TAKE_DRAWN=1 pytest tests/lifted/drawing`
 and says in its commit, with statistics, that new rooms are as good.
 """
 
@@ -16,7 +16,7 @@ import sceneprior
 from sceneprior.core.classes import label_set
 from sceneprior.core.scene import Scene, SceneObject
 
-GOLDEN = Path(__file__).parent.parent / "golden" / "drawn_rooms.npz"
+GOLDEN = Path(__file__).parents[2] / "golden" / "drawn_rooms.npz"
 ROOMS = 20
 """Plain rooms of a prior, and requested rooms of all its requests together."""
 MAY_DIFFER = 2

@@ -1,0 +1,206 @@
+"""Drawing of rooms: sequential Monte Carlo over partly furnished rooms, repeated until they are
+whole. A plain room has no conditions and one particle."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from sceneprior.core.errors import InputError
+from sceneprior.lifted.drawing.particles import Particles, steps_of
+from sceneprior.lifted.drawing.plans import RoomPlans, check_floor, plan_rooms
+from sceneprior.lifted.drawing.steps import NUMBERS, Rejections, place_next
+from sceneprior.lifted.requests.floors import RoomShape
+from sceneprior.lifted.requests.relations import furniture_in
+from sceneprior.lifted.requests.request import Conditions
+from sceneprior.lifted.requests.rules import PlacementRules
+from sceneprior.lifted.rooms import PosedRooms
+from sceneprior.lifted.sampler.contents import END
+from sceneprior.lifted.sampler.network import RoomSampler
+from sceneprior.lifted.sampler.rooms import FRAME_M, gaps_m
+
+OPEN_M = 3 * FRAME_M
+"""Distance in metres beyond which a side of a drawn rectangle counts as empty: 1 of 370 sides in
+the training rooms exceeds it."""
+BATCH = 512
+"""Particles furnished at a time."""
+
+
+class Effort(NamedTuple):
+    """How hard rooms are tried."""
+
+    particles: int
+    """Particles of a room. With more, an attempt meets rarer wishes, in proportionally more
+    time."""
+    attempts: int
+    """Maximum number of attempts at a room."""
+    attempts_per_plan: int
+    """Attempts before a room is planned anew."""
+    whole: int
+    """Attempts in which no object may be left out. Later ones place required objects first, and
+    leave out others without a place; the last one leaves out any."""
+    together: int
+    """Particles for which attempts are made side by side, if fewer rooms are left; the first
+    successful attempt counts. A step takes about as long for one room as for these."""
+
+
+PLAIN = Effort(particles=1, attempts=48, attempts_per_plan=16, whole=47, together=32)
+"""Rooms with conditions that are inputs of the network: a rectangle, and given objects."""
+REQUESTED = Effort(particles=6, attempts=12, attempts_per_plan=1, whole=4, together=1)
+
+
+@dataclass(frozen=True)
+class SampledRooms:
+    """Sampled rooms; every part has one entry per room."""
+
+    rooms: PosedRooms
+    """Given objects come first, with their own boxes."""
+    shapes: tuple[RoomShape | None, ...]
+    """None for a room of which only the rectangle is known (`PosedRooms.rectangle_m`)."""
+    missing: tuple[tuple[int, ...], ...]
+    """Classes of required objects that found no place."""
+
+
+@torch.no_grad()
+def draw_rooms(
+    sampler: RoomSampler, conditions: Conditions, count: int, seed: int, may_lack: bool = False
+) -> SampledRooms:
+    """Sample new rooms that meet conditions.
+
+    What the conditions leave open of a room's rectangle and contents is sampled first
+    (`plan_rooms`), then its objects one by one, in every particle at the first of a few sampled
+    places where it neither intersects an object that it should not (`RoomSampler.may_meet`) nor
+    extends beyond the rectangle nor breaks a rule. Particles without such a place are replaced by
+    others; if none is left, the room is furnished again. So it is if a side of its sampled
+    rectangle stays empty (`OPEN_M`), which is rare in training rooms.
+
+    A seed always draws the same rooms, and the first ones do not depend on `count`.
+
+    Args:
+        may_lack: Required objects may be missing from all rooms.
+
+    Raises:
+        InputError: no room can meet the conditions, or none was found; the message says why.
+    """
+    check_floor(sampler, conditions, may_lack)
+    hard = conditions.has_rules or bool(conditions.wishes.labels)
+    effort, rejections = REQUESTED if hard else PLAIN, Rejections()
+    slots, size = sampler.max_objects, max(1, BATCH // effort.particles)
+    none = torch.zeros(count, slots, dtype=torch.int64)
+    rooms = PosedRooms(
+        none, none > 0, torch.zeros(count, slots, 6), looks=none.clone()
+    )  # fmt: skip
+    rectangle_m, finished = torch.zeros(count, 4), set[int]()
+    shapes: list[RoomShape | None] = [None] * count
+    missing: list[tuple[int, ...]] = [()] * count
+    waiting, number, last = list(range(count)), 0, effort.attempts - 1
+    while waiting:
+        if number % effort.attempts_per_plan == 0:
+            planned = {row: at for at, row in enumerate(waiting)}
+            draws = [_random(seed, row, 0, number) for row in waiting]
+            plans = plan_rooms(sampler, conditions, draws, number >= effort.whole)
+        # The very last attempt is by itself, because it leaves out objects.
+        until = effort.attempts_per_plan * (number // effort.attempts_per_plan + 1)
+        until = min(number + max(1, effort.together // len(waiting)), until, last)
+        attempts = range(number, max(until, number + 1))
+        for start in range(0, len(waiting), size):
+            some = waiting[start : start + size]
+            tried = [(row, attempt) for attempt in attempts for row in some]
+            own = plans.take(torch.tensor([planned[row] for row, _ in tried]))
+            draws = [_random(seed, row, 1, attempt) for row, attempt in tried]
+            particles, best, lacking = _furnish(
+                sampler, conditions, own, draws, number, effort, rejections
+            )
+            # The first successful attempt counts, so later ones are overwritten.
+            done = [at for at in reversed(range(len(tried))) if best[at] >= 0]
+            for at in done:
+                shapes[tried[at][0]], missing[tried[at][0]] = own.shapes[at], tuple(lacking[at])
+            first = {tried[at][0]: at for at in done}
+            to, at = torch.tensor([*first]).long(), torch.tensor([*first.values()]).long()
+            for whole, part in zip(_parts(rooms), _parts(particles.rooms), strict=True):
+                whole[to] = part[best[at]]
+            rectangle_m[to] = own.rectangle_m[at]
+            finished |= first.keys()
+        waiting = [row for row in waiting if row not in finished]
+        number = attempts.stop
+    if count and all(missing) and not may_lack:
+        raise InputError(_in_the_way(rejections, missing[0], conditions.classes))
+    return SampledRooms(replace(rooms, rectangle_m=rectangle_m), tuple(shapes), tuple(missing))
+
+
+def _random(*seed: int) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+def _parts(rooms: PosedRooms) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    assert rooms.looks is not None
+    return rooms.object_class, rooms.is_object, rooms.boxes_m, rooms.looks
+
+
+def _furnish(
+    sampler: RoomSampler,
+    conditions: Conditions,
+    plans: RoomPlans,
+    draws: Sequence[np.random.Generator],
+    number: int,
+    effort: Effort,
+    rejections: Rejections,
+) -> tuple[Particles, Int[Tensor, " rooms"], list[list[int]]]:
+    """Make attempt `number` at each room.
+
+    Returns:
+        The particles; the best one of each room, or -1 if the room is to be furnished again; and
+        the classes of required objects that were left out.
+    """
+    particles, last = Particles(plans, effort.particles), number == effort.attempts - 1
+    rules = None
+    if conditions.has_rules:
+        given = [furniture_in(sampler, plans.rooms, room) for room in range(len(draws))]
+        relations = conditions.wishes.relations
+        rules = [
+            PlacementRules(shape, relations, conditions.classes, own)
+            for shape, own in zip(plans.shapes, given, strict=True)
+            if shape is not None
+        ]
+    shape = (sampler.max_objects, effort.particles, NUMBERS)
+    numbers = torch.from_numpy(np.stack([own.random(shape) for own in draws])).float()
+    failed: set[int] = set()
+    missing: list[list[int]] = [[] for _ in draws]
+    for step in steps_of(plans):
+        own = numbers[:, step].flatten(0, 1)
+        place_next(sampler, particles, rules, step, own, draws, rejections)
+        dead = (~particles.alive).unflatten(0, (-1, effort.particles)).any(dim=1)
+        for room in set(dead.nonzero()[:, 0].tolist()) - failed:
+            rows, required = particles.rows_of(room), bool(plans.required[room, step])
+            if particles.alive[rows].any():
+                particles.replace_dead(room, draws[room])
+            elif number < effort.whole or (required and not last):
+                failed.add(room)
+            else:  # left out
+                particles.alive[rows] = True
+                missing[room] += [int(plans.upcoming[room, step])] * required
+    good = particles.alive
+    if conditions.floor is None and number < effort.whole:
+        added = (plans.upcoming != END).any(dim=1)[particles.room]
+        gaps = gaps_m(particles.rooms, plans.rectangle_m[particles.room])
+        good = good & ~(added & (gaps.amax(dim=-1) > OPEN_M))
+    good = good.unflatten(0, (-1, effort.particles))
+    best = torch.arange(len(draws)) * effort.particles + good.int().argmax(dim=1)
+    return particles, best.where(good.any(dim=1), -1), missing
+
+
+def _in_the_way(rejections: Rejections, missing: Sequence[int], classes: Sequence[str]) -> str:
+    """The error message for a request that no attempt met."""
+    label = missing[0]
+    own = Counter({what: times for (index, what), times in rejections.items() if index == label})
+    what = own.most_common(1)[0][0] if own else "free floor"
+    return (
+        f"No room holds the request: in {REQUESTED.attempts} attempts with {REQUESTED.particles} "
+        f"partial rooms each, a {classes[label].replace('_', ' ')} found no place; most places "
+        f"lacked {what}. Ask for less, or for a larger floor."
+    )

@@ -1,0 +1,158 @@
+"""Rooms of shipped priors as scenes: plain, on request, and round what is given."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import shapely
+from refusals import refused
+
+import sceneprior
+from sceneprior.apps.config import load_run
+from sceneprior.apps.sample import sample_rooms
+from sceneprior.core.classes import label_set
+from sceneprior.core.errors import InputWarning
+from sceneprior.core.scene import Scene, SceneObject
+from sceneprior.lifted.drawing.draw import draw_rooms
+from sceneprior.lifted.lifting import HANGS_M
+from sceneprior.lifted.requests.request import Conditions
+from sceneprior.paper.sampling import draw_latents
+
+L_SHAPE = [[0, 0], [5, 0], [5, 3], [2.5, 3], [2.5, 6], [0, 6]]
+EDGE_M = 0.015
+"""Furniture may extend beyond the floor by a centimetre."""
+BED = SceneObject("double_bed", (0.2, 0.3, -0.9), (1.7, 0.6, 2.1))
+
+
+@pytest.fixture(scope="module")
+def prior():
+    return sceneprior.load("procthor-bedroom")
+
+
+def labels(room: Scene) -> list[str]:
+    return [item.label for item in room.objects]
+
+
+def assert_on_floor(room: Scene) -> None:
+    low, high = room.centers_m - room.sizes_m / 2, room.centers_m + room.sizes_m / 2
+    footprints = shapely.box(low[:, 0], low[:, 2], high[:, 0], high[:, 2])
+    on = shapely.Polygon(room.floor_m).buffer(EDGE_M, join_style="mitre")
+    assert on.covers(footprints).all()
+
+
+def test_rooms_come_from_the_sampler_and_others_if_asked(sampler_run, few_attempts):
+    trained = load_run(sampler_run)
+    made = sample_rooms(trained, 3, 5)
+    assert [scene.latent for scene in made] == [None] * 3 and made[0].name == "seed5_0000"
+    assert all(item.mesh is not None for room in made for item in room.objects)
+    z, _ = draw_latents(trained, 3, 5, "paper")
+    latents = [scene.latent for scene in sample_rooms(trained, 3, 5, "paper")]
+    np.testing.assert_array_equal(np.stack(latents), z)
+    early = replace(trained, sampler=None, stage="shape")
+    assert early.distribution == "paper" and sample_rooms(early, 2, 0)[0].latent is not None
+
+
+def test_runs_without_a_sampler_say_so(toy_run):
+    prior = sceneprior.load(toy_run)
+    with refused("requests/no_sampler"):
+        prior.sample(2, 0, "sampler")
+    with refused("requests/no_sampler_for_completion"):
+        prior.complete(Scene("mine", "front3d_bedroom", (BED,)), classes=["desk"])
+
+
+@pytest.mark.parametrize(
+    ("floor", "said"), [("1x1", "1.0 square metres is smaller"), ("40x40", "is larger")]
+)
+def test_floors_unlike_those_of_training_rooms_are_noted(prior, floor, said):
+    with pytest.warns(InputWarning, match=f"{said} than in nearly all training rooms"):
+        prior.sample(1, floor=floor)
+
+
+@pytest.mark.filterwarnings("error::sceneprior.core.errors.InputWarning")
+@pytest.mark.parametrize("floor", ["4x3", L_SHAPE, [[0, 0], [4, 0], [5, 3], [2, 4], [0, 3]]])
+def test_furniture_stays_on_the_floor(prior, floor):
+    for room in prior.sample(4, seed=0, floor=floor):
+        assert room.objects and room.floor_m is not None
+        assert np.allclose(room.floor_m.min(axis=0) + room.floor_m.max(axis=0), 0)
+        assert_on_floor(room)
+
+
+def test_counts_hold_exactly(prior):
+    want = {"double_bed": 1, "single_bed": 0, "nightstand": 2, "desk": ">=1", "cabinet": "<=1"}
+    for room in prior.sample(6, seed=0, floor="5x4", want=want):
+        found = labels(room)
+        assert [found.count(label) for label in list(want)[:3]] == [1, 0, 2]
+        assert found.count("desk") >= 1 and found.count("cabinet") <= 1
+        assert room.extra["wishes"][2] == {"wish": "2 nightstand", "holds": True}
+        assert room.extra["request"] == {"floor": "5x4", "want": want}
+
+
+def test_small_rooms_hold_less(prior):
+    small, large = (prior.sample(12, seed=0, floor=floor) for floor in ("3x3", "6x6"))
+    assert sum(map(len, map(labels, small))) < sum(map(len, map(labels, large)))
+
+
+def test_without_a_floor_a_rectangle_is_drawn(prior):
+    rooms = prior.sample(3, seed=2, want={"double_bed": 2})
+    assert [labels(room).count("double_bed") for room in rooms] == [2, 2, 2]
+    assert len({room.floor_m.max() for room in rooms}) == 3
+    for room in rooms:
+        assert_on_floor(room)
+
+
+def test_nothing_reaches_through_the_ceiling_and_lamps_hang_from_it(prior):
+    rooms = prior.sample(4, seed=0, floor="4x4", ceiling_m=2.2, want={"ceiling_lamp": 1})
+    for room in rooms:
+        tops = room.centers_m[:, 1] + room.sizes_m[:, 1] / 2
+        assert room.ceiling_m == 2.2 and tops.max() <= 2.211
+        assert tops[labels(room).index("ceiling_lamp")] == pytest.approx(2.2, abs=1e-4)
+
+
+def test_where_floor_is_scarce_beds_stand_on_it_and_keep_their_size(prior):
+    want = {"double_bed": 1, "single_bed": 1, "desk": 2, "sofa": 1}
+    for room in prior.sample(2, seed=0, floor="3.4x3", openings="door", want=want):
+        for item in room.objects:
+            if "bed" in item.label:
+                assert item.center_m[1] - item.size_m[1] / 2 <= 0.151
+                assert item.size_m[0] * item.size_m[2] > 1.1  # m2
+
+
+def test_completions_hold_what_is_given_exactly_and_differ(prior):
+    rooms = prior.complete(Scene("mine", "front3d_bedroom", (BED,)), 9, seed=1)
+    for room in rooms:
+        first = room.objects[0]
+        assert (first.label, first.center_m, first.size_m) == (BED.label, BED.center_m, BED.size_m)
+        assert first.mesh is not None  # of the look that was recognised
+        assert room.extra["given"] == [0] and room.latent is None
+    assert rooms[0].name == "complete_00"
+    assert len({tuple(room.centers_m.round(3).ravel()) for room in rooms}) > 3
+    stool = SceneObject("dressing_table", (0.0, 0.3, 0.0), (0.5, 0.6, 0.5))  # in no training room
+    (room,) = prior.complete(Scene("mine", "front3d_bedroom", (stool,)), 1)
+    assert room.objects[0].label == "dressing_table" and room.objects[0].mesh is None
+
+
+def test_all_chairs_that_were_wanted_stand_round_a_given_table():
+    floor = np.array([[-2.5, -2.5], [2.5, -2.5], [2.5, 2.5], [-2.5, 2.5]])
+    table = SceneObject("table", (0.0, 0.375, 0.0), (1.6, 0.75, 0.9))
+    given = Scene("mine", "front3d_living", (table,), floor)
+    rooms = sceneprior.load("procthor-living").complete(given, 8, 0, classes=["chair"] * 4)
+    assert [labels(room) for room in rooms] == [["table", *["chair"] * 4]] * 8
+    assert all(room.extra["no_place"] == [] for room in rooms)
+
+
+def test_furniture_stands_on_the_floor_and_what_hangs_stays_there(prior):
+    conditions = Conditions(tuple(label_set(prior.label_set)))
+    drawn = draw_rooms(prior.trained.sampler, conditions, 20, 1).rooms
+    reaching = []
+    for row, room in enumerate(prior.sample(20, seed=1)):
+        boxes_m = drawn.boxes_m[row, drawn.is_object[row]].double().numpy()
+        for item, box_m in zip(room.objects, boxes_m, strict=True):
+            bottom, lowest = box_m[1] - box_m[4] / 2, item.mesh.vertices_m[:, 1].min()
+            assert item.size_m == pytest.approx(box_m[3:])
+            if bottom < HANGS_M:
+                assert item.center_m[1] == item.size_m[1] / 2
+                reaching.append(abs(lowest) < 0.005)
+            else:
+                assert item.center_m[1] == pytest.approx(box_m[1])
+                assert lowest >= bottom - 0.001
+    assert len(reaching) > 60 and np.mean(reaching) > 0.9
