@@ -57,8 +57,8 @@ def evaluate_run(
         asked: Request for the rooms, as arguments of `Prior.sample`; only with `use`.
     """
     trained = load_any_run(run)
-    known = shards or Path(trained.config.data.shards)
-    if shards is None and not known.is_dir():
+    known: Path | None = shards or Path(trained.config.data.shards)
+    if shards is None and known is not None and not known.is_dir():
         if use is None:
             raise InputError(
                 f"{run} was trained on shards '{known}', which do not exist; name the shards to "

@@ -21,49 +21,33 @@ from sceneprior.evaluation.metrics.contents import category_kl, class_counts
 from sceneprior.paper.sampling import COPIES
 
 
-def test_the_users_scenes_are_evaluated(command, scenes, toy_shards, tmp_path):
-    call = ["eval-fid", "--scenes", scenes, "--shards", toy_shards]
-    status, out, errors = command(*call, "--resamples", 20)
-    assert status == 0, errors
-    assert f"Wrote {scenes / 'scores.json'}" in out.replace("\n", "") and "4 rooms" in out
-    first = json.loads((scenes / "scores.json").read_text())
-    assert first["protocol"]["scenes"] == "scenes" and first["protocol"]["resamples"] == 20
-    assert first["near_copy_share"] == 1 and first["out_of_bounds_share"] == 0
-    # scores.json lies among the scenes now, and is none.
-    status, _, errors = command(*call, "--resamples", 20, "--out", "b.json")
-    assert status == 0, errors
-    assert json.loads((tmp_path / "b.json").read_text()) == first
-    status, _, errors = command(*call, "-n", 2, "--seed", 3, "--resamples", 0, "--out", "c.json")
-    assert status == 0, errors
-    protocol = json.loads((tmp_path / "c.json").read_text())["protocol"]
-    assert (protocol["n_generated"], protocol["n_scenes_available"]) == (2, 4)
-
-
-def test_scenes_have_a_page_with_their_scores(command, scenes, toy_shards, tmp_path):
-    given = ["--scenes", scenes, "--shards", toy_shards]
-    scored = tmp_path / "s.json"
-    assert command("eval-fid", *given, "--resamples", 0, "--out", scored)[0] == 0
-    call = ["report", *given, "--out", "page.html"]
-    status, out, errors = command(*call, "--scores", scored)
-    assert (status, out) == (0, "Wrote page.html\n"), errors
-    page = (tmp_path / "page.html").read_text()
-    assert re.findall("<h2>(.*)</h2>", page) == ["New rooms beside real ones", "Scores"]
-    assert "scenes scenes" in page and "scenes as given, which were made elsewhere" in page
-    assert "room_0" not in errors and page.count("<h3>Generated</h3>") == 1
-
-
-def test_other_json_among_scenes_is_said(command, scenes, toy_shards, tmp_path):
-    folder = shutil.copytree(scenes, tmp_path / "mixed")
+def test_the_users_scenes_are_evaluated_and_have_a_page(command, scenes, toy_shards, tmp_path):
+    folder = shutil.copytree(scenes, tmp_path / "mine", ignore=shutil.ignore_patterns("scores*"))
     (folder / "cameras.json").write_text("[1, 2]")
     (folder / "room_9.json").write_text('{"objects": []}')
-    call = ["eval-fid", "--scenes", folder, "--shards", toy_shards]
-    status, _, errors = command(*call, "--resamples", 0)
-    assert status == 0
+    given = ["--scenes", folder, "--shards", toy_shards]
+    status, out, errors = command("eval-fid", *given, "--resamples", 20)
+    assert status == 0, errors
+    assert f"Wrote {folder / 'scores.json'}" in out.replace("\n", "") and "4 rooms" in out
     (said,) = (line for line in errors.splitlines() if "Warning: " in line)
     assert said.endswith(
         f"4 scenes are read from {folder}; 2 other JSON files there are not scenes ('format' is "
         "not sceneprior-scene) and are skipped: cameras.json, room_9.json."
     )
+    scores = json.loads((folder / "scores.json").read_text())
+    assert scores["protocol"]["scenes"] == "mine" and scores["protocol"]["resamples"] == 20
+    assert scores["near_copy_share"] == 1 and scores["out_of_bounds_share"] == 0
+    status, out, errors = command("report", *given, "--out", "page.html")
+    assert (status, out) == (0, "Wrote page.html\n"), errors
+    page = (tmp_path / "page.html").read_text()
+    assert re.findall("<h2>(.*)</h2>", page) == ["New rooms beside real ones", "Scores"]
+    assert "scenes mine" in page and "scenes as given, which were made elsewhere" in page
+    assert page.count("<h3>Generated</h3>") == 1
+    # scores.json lies among the scenes now, and is none.
+    call = ["eval-fid", *given, "-n", 2, "--seed", 3, "--resamples", 0, "--out", "c.json"]
+    assert command(*call)[0] == 0
+    protocol = json.loads((tmp_path / "c.json").read_text())["protocol"]
+    assert (protocol["n_generated"], protocol["n_scenes_available"]) == (2, 4)
 
 
 def test_a_run_whose_rooms_are_copies_is_warned_of_wherever_it_draws(command, toy_run, tmp_path):
