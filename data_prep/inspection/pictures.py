@@ -142,7 +142,8 @@ def draw_plan(shard: Shard, room_id: str, width_px: int = 480, height_px: int = 
                 draw, (corners[0] + 2, corners[1] + 2), label, _dark(colors[truth.object_class[k]])
             )
     if has_stuff:
-        for lines, color in zip(find_walls(room), (WALL, DOOR), strict=True):
+        walls, doors = find_walls(room)
+        for lines, color in ((walls, WALL), (doors, DOOR)):
             for line in lines:
                 draw.line((*at(*line.start_m), *at(*line.end_m)), fill=color, width=4)
     for matrix in room.world_to_camera.astype(np.float64):

@@ -102,7 +102,7 @@ def pixel_rays(
     centre = intrinsics[..., :2, 2][..., None, :]
     on_plane = (pixels - centre) / focal
     if isinstance(on_plane, np.ndarray):
-        directions = np.concatenate([on_plane, np.ones_like(on_plane[..., :1])], axis=-1)
+        directions: Any = np.concatenate([on_plane, np.ones_like(on_plane[..., :1])], axis=-1)
     else:
         import torch
 

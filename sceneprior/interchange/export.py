@@ -10,7 +10,7 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.files import write_whole
 from sceneprior.core.scene import Scene
 from sceneprior.core.shell import ShellName, shell_meshes, shell_of
-from sceneprior.interchange.atiss import write_atiss
+from sceneprior.interchange.box_lists import write_atiss
 from sceneprior.interchange.front import write_front
 from sceneprior.interchange.habitat import write_habitat
 from sceneprior.interchange.sceneeval import write_sceneeval
