@@ -15,6 +15,7 @@ from data_prep.engine.build import Job, build_shards
 from data_prep.inspection.sheet import draw_sheet, legend
 from data_prep.inspection.tables import count_tables, room_table
 from data_prep.inspection.verify import verify
+from data_prep.readers.posed.reader import Posed
 from sceneprior.core.boxes import yaw_rotation
 
 RULES = ("views.per_m2=1.5", "views.image_size=[120, 160]")
@@ -137,7 +138,7 @@ def test_the_legend_explains_what_the_sheet_shows(shards, tmp_path, monkeypatch)
 
     monkeypatch.setattr("data_prep.inspection.sheet.legend", spied)
     room = PosedRoom(tmp_path / "rooms" / "attic").write()
-    build_shards(Job(PosedSource(room.folder, SET), tmp_path / "posed"))
+    build_shards(Job(Posed(room.folder, classes=SET), tmp_path / "posed"))
     draw_sheet(shards, pictures=1)
     draw_sheet(shards, "house0_Bedroom-0", pictures=1)
     draw_sheet(tmp_path / "posed", "attic", pictures=1)
@@ -154,7 +155,7 @@ def test_tables_say_how_far_rooms_were_turned(tmp_path):
     turn[:2, :2] = yaw_rotation(np.radians(20.0))[::2, ::2]
     room.poses = [turn @ pose for pose in room.poses]
     room.write_transforms(room.data)
-    build_shards(Job(PosedSource(room.folder, SET), tmp_path / "shards"))
+    build_shards(Job(Posed(room.folder, classes=SET), tmp_path / "shards"))
     (caption,) = (table.caption for table in count_tables(tmp_path / "shards") if table.caption)
     table = room_table(tmp_path / "shards", "attic")
     assert list(map(str, table.columns[0].cells)) == ["1", "2"], "as in the images of ids"
