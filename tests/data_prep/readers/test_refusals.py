@@ -409,6 +409,8 @@ OTHERS["scannet"] = {
     "zip with a frame twice": masks(a__1=png(GREY), b__001=png(GREY)),
     "zip without masks": masks(text=b""),
     "zip that leads out": masks(**{"..__0": png(GREY)}),
+    "zip with a root": masks(**{"__etc__0": png(GREY)}),
+    "zip with a drive": masks(**{"C:\\0": png(GREY)}),
     "zip cut": cut(FILT, 300),
 }  # fmt: skip
 
