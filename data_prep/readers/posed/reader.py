@@ -184,24 +184,23 @@ class Posed(Reader):
             except InputError:
                 continue  # the report will have the error
             recordings.append(recording)
-        count = len(recordings)
+        rooms = f"of {len(recordings)} rooms"
         sentences = []
         if single := sum(len(recording.frames) < 2 for recording in recordings):
             sentences.append(
-                f"{single} of {count} rooms have only one frame, which shows no depth: objects are "
-                "lifted to 3D from at least two views, better twenty."
+                f"{single} {rooms} have only one frame, which shows no depth: objects are lifted "
+                "to 3D from at least two views, better twenty."
             )
         if untracked and self.tracks != "auto":
             sentences.append(
-                f"In {len(untracked)} of {count} rooms ids belong to single images "
-                f"({untracked[0]}): objects are found from poses, masks and classes, as with "
-                "--tracks auto."
+                f"In {len(untracked)} {rooms} ids belong to single images ({untracked[0]}): "
+                "objects are found from poses, masks and classes, as with --tracks auto."
             )
         unknown = sum(recording.floor_m is None for recording in recordings)
         if unknown and self.floor_m is None:
             sentences.append(
-                f"{unknown} of {count} rooms give no floor_m: the floor is estimated from the "
-                "lowest pieces (median error 1 to 2 cm in our tests), or else assumed "
+                f"{unknown} {rooms} give no floor_m: the floor is estimated from the lowest pieces "
+                "(median error 1 to 2 cm in our tests), or else assumed "
                 f"{self.camera_height_m:g} m below the lowest camera (error 21 cm); report.csv "
                 "says which. Measure the floor and give floor_m or --floor-m, or at least the "
                 "lowest camera's height with --camera-height-m."
@@ -209,27 +208,26 @@ class Posed(Reader):
         unknown = sum(recording.metres_per_unit is None for recording in recordings)
         if unknown and self.metres_per_unit == 1:
             sentences.append(
-                f"{unknown} of {count} rooms give no metres_per_unit: poses are assumed to be in "
-                "metres, which COLMAP's are not."
+                f"{unknown} {rooms} give no metres_per_unit: poses are assumed to be in metres, "
+                "which COLMAP's are not."
             )
-        ups = [recording.up if self.up == "auto" else self.up for recording in recordings]
-        lying = sum(recording.up == "cameras" for recording in recordings)
-        if lying and self.up == "auto":
+        stated = [recording for recording in recordings if recording.up != "cameras"]
+        if (lying := len(recordings) - len(stated)) and self.up == "auto":
             sentences.append(
-                f"{lying} of {count} rooms do not state the up direction: it is estimated from the "
-                "cameras, as if they were held upright. If they roll by 5 degrees, the median "
-                "error is 1.3 degrees, and floors rise by 5 cm in 2 m. Turn the poses until an "
-                "axis points up, and name it with --up."
+                f"{lying} {rooms} do not state the up direction: it is estimated from the cameras, "
+                "as if they were held upright. If they roll by 5 degrees, the median error is 1.3 "
+                "degrees, and floors rise by 5 cm in 2 m. Turn the poses until an axis points up, "
+                "and name it with --up."
             )
         for taken, axis in (("z", "y"), ("y", "z")):
-            other = sum(
-                up == taken and recording.up != "cameras" and seems_up(recording) == axis
-                for up, recording in zip(ups, recordings, strict=True)
-            )
-            if other:
+            if other := sum(
+                taken == (recording.up if self.up == "auto" else self.up)
+                and seems_up(recording) == axis
+                for recording in stated
+            ):
                 sentences.append(
-                    f"In {other} of {count} rooms the tops of the pictures point along {axis}, but "
-                    f"{taken} is taken as up; should it be --up {axis}?"
+                    f"In {other} {rooms} the tops of the pictures point along {axis}, but {taken} "
+                    f"is taken as up; should it be --up {axis}?"
                 )
         return sentences
 
