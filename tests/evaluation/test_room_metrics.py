@@ -15,7 +15,7 @@ from sceneprior.core.scene import Scene
 from sceneprior.evaluation.metric import Comparison
 from sceneprior.evaluation.metrics import METRICS
 from sceneprior.evaluation.metrics.contents import (
-    category_kl_of_counts,
+    category_kl,
     class_counts,
     reconstruction_scores,
 )
@@ -33,7 +33,7 @@ from sceneprior.evaluation.metrics.relations import (
 
 def kl(generated: list[Scene], test: list[Scene]) -> float:
     once = np.ones((0, len(generated)), int), np.ones((0, len(test)), int)
-    return category_kl_of_counts(class_counts(generated), class_counts(test), *once).value
+    return category_kl(class_counts(generated), class_counts(test), *once).value
 
 
 def test_category_kl_by_hand():

@@ -17,7 +17,7 @@ from sceneprior.evaluation.metric import METHOD, Estimate, emptiness, mean_of_ro
 from sceneprior.evaluation.metrics import METRICS
 from sceneprior.evaluation.metrics.contents import (
     TYPE_CLASSES,
-    category_kl_of_counts,
+    category_kl,
     class_counts,
     common_label_set,
 )
@@ -61,9 +61,7 @@ def evaluate_from_views(
             held = table[:, [label_set(names).index(label) for label in wanted]].any(axis=1)
             found["type_share"] = mean_of_rooms(held.astype(float), draws[name], 1.0)
         if name != "test":
-            found["category_kl"] = category_kl_of_counts(
-                table, counts["test"], draws[name], draws["test"]
-            )
+            found["category_kl"] = category_kl(table, counts["test"], draws[name], draws["test"])
         columns[name] = found
     volumes = [room_overlaps(scene).volumes_m3.sum() for scene in generated]
     columns["generated"]["overlap_volume_m3"] = mean_of_rooms(volumes, draws["generated"])

@@ -193,7 +193,7 @@ class Explorer:
         return Shown(room.scene, f"path, step {number} of {PATH_STEPS - 1}")
 
     def nearest(self, scene: Scene) -> tuple[Shown, float]:
-        """The decoded training room with the nearest layout, and its `layout_distance` (metres)."""
+        """The decoded training room with the nearest layout, and its distance in metres."""
         row, distance_m = nearest_room(scene, self._training_layouts)
         return self.training_room(row), distance_m
 

@@ -4,7 +4,7 @@ objects of decoded training rooms that match the ground truth."""
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from sceneprior.core.boxes import SceneMatch, match_scenes
 from sceneprior.core.classes import LABEL_SETS, VOID, label_set
@@ -60,33 +60,33 @@ def _shares(counts: np.ndarray) -> np.ndarray:
     return np.asarray(counts / np.maximum(counts.sum(-1, keepdims=True), 1))
 
 
-def category_kl(p: Float[np.ndarray, " classes"], q: Float[np.ndarray, " classes"]) -> float:
-    """KL divergence of the generated rooms' class frequencies q from the test rooms' p, in nats.
-
-        KL = sum_c p_c * (log(p_c + 1e-6) - log(q_c + 1e-6))  (Paschalidou et al., NeurIPS 2021)
-
-    Both leave void out. Comparing with training rooms instead of test rooms would give values that
-    are too good.
-    """
-    return float((p * (np.log(p + KL_EPSILON) - np.log(q + KL_EPSILON))).sum())
-
-
 def _holds_its_type(scene: Scene) -> bool | None:
     """True if a scene holds the furniture of its room type; None without a room type."""
     wanted = TYPE_CLASSES.get(scene.label_set)
     return None if wanted is None else any(item.label in wanted for item in scene.objects)
 
 
-def category_kl_of_counts(
+def category_kl(
     rooms: Int[np.ndarray, "rooms classes"],
     test: Int[np.ndarray, "test classes"],
     counts: Int[np.ndarray, "resamples rooms"],
     test_counts: Int[np.ndarray, "resamples test"],
 ) -> Estimate:
-    """`category_kl` from the objects of each class, with its value on every resample."""
+    """KL divergence of the generated rooms' class frequencies q from the test rooms' p, in nats,
+    from the objects of each class.
+
+        KL = sum_c p_c * (log(p_c + 1e-6) - log(q_c + 1e-6))  (Paschalidou et al., NeurIPS 2021)
+
+    Both leave void out. Comparing with training rooms instead of test rooms would give values that
+    are too good.
+    """
+
+    def divergence(p: np.ndarray, q: np.ndarray) -> float:
+        return float((p * (np.log(p + KL_EPSILON) - np.log(q + KL_EPSILON))).sum())
+
+    value = divergence(_shares(test.sum(0)), _shares(rooms.sum(0)))
     pairs = zip(_shares(test_counts @ test), _shares(counts @ rooms), strict=True)
-    value = category_kl(_shares(test.sum(0)), _shares(rooms.sum(0)))
-    return Estimate(value, np.array([category_kl(p, q) for p, q in pairs]), 0.0)
+    return Estimate(value, np.array([divergence(p, q) for p, q in pairs]), 0.0)
 
 
 @metric(
@@ -97,7 +97,7 @@ def category_kl_of_counts(
 def _category_kl(rooms: RoomSet, comparison: Comparison) -> Estimate:
     test = comparison.test
     tables = class_counts(rooms.scenes), class_counts(test.scenes)
-    return category_kl_of_counts(*tables, rooms.counts, test.counts)
+    return category_kl(*tables, rooms.counts, test.counts)
 
 
 metric("mean_objects", "Objects in a room", "mean", "none", column=TableColumn("objects", 2))(

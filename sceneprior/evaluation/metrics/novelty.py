@@ -35,28 +35,6 @@ TURNS = tuple(
 """The four quarter turns of a room and of its mirror image, the augmentations of training."""
 
 
-def layout_distance(a: Scene, b: Scene) -> float:
-    """Mean cost, in metres, of moving and resizing one room's furniture to match the other's.
-
-    Objects are paired one to one within classes at minimum total cost. A pair costs the norm of
-    (difference of centres, difference of sizes), at most 1 m; an object without a partner costs 1
-    m. The total is divided by the number of objects in the larger room: 0 for equal layouts, 1 for
-    layouts without a common object. Two empty rooms are at distance 0.
-
-    Example: one of two chairs moved by 30 cm.
-
-        >>> from sceneprior.core.scene import SceneObject
-        >>> def room(x):
-        ...     chairs = [((0.0, 0.5, 0.0)), ((x, 0.5, 2.0))]
-        ...     chairs = tuple(SceneObject("chair", at, (0.5, 1.0, 0.5)) for at in chairs)
-        ...     return Scene("a", "front3d_bedroom", chairs)
-        >>> round(layout_distance(room(1.0), room(1.3)), 9)
-        0.15
-    """
-    costs = _costs(_rows(a), _rows(b))
-    return _total(costs) / max(*costs.shape, 1)
-
-
 def _costs(placed: np.ndarray, others: np.ndarray) -> np.ndarray:
     # SciPy is imported here, since most commands import this module without comparing rooms.
     from scipy.spatial.distance import cdist
@@ -85,6 +63,12 @@ def nearest_distances(
     as_copies: bool = False,
 ) -> Float[np.ndarray, " scenes"]:
     """Layout distance of each scene to the nearest training room, minimised over all of `TURNS`.
+
+    The distance is the mean cost, in metres, of moving and resizing one room's furniture to match
+    the other's. Objects are paired one to one within classes at minimum total cost. A pair costs
+    the norm of (difference of centres, difference of sizes), at most 1 m; an object without a
+    partner costs 1 m. The total is divided by the number of objects in the larger room: 0 for equal
+    layouts, 1 for layouts without a common object. Two empty rooms are at distance 0.
 
     The search is exact. A lower bound, in which every object takes its cheapest partner, rules out
     most training rooms without an assignment. The distance of a scene that has no training room to

@@ -5,7 +5,6 @@ It is 0.5 if the two sets are indistinguishable, and 1 if every room is classifi
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -55,22 +54,6 @@ Classify = Callable[[np.ndarray, np.ndarray, np.ndarray, int], np.ndarray]
 """(training inputs, their 0/1 labels, inputs to classify, seed) -> 0/1 answers."""
 
 
-@dataclass(frozen=True)
-class CrossValidated:
-    """Numbers of all and of correct predictions for each room while it was held out."""
-
-    right_generated: Int[np.ndarray, " n"]
-    asked_generated: Int[np.ndarray, " n"]
-    right_real: Int[np.ndarray, " m"]
-    asked_real: Int[np.ndarray, " m"]
-
-    def accuracy(self, counts_generated: np.ndarray, counts_real: np.ndarray) -> Estimate:
-        """Share of correct predictions; both sets have the same weight."""
-        generated = ratio(self.right_generated, self.asked_generated, counts_generated)
-        real = ratio(self.right_real, self.asked_real, counts_real)
-        return mean_of_shares(generated, real)
-
-
 def linear(
     features: Float[np.ndarray, "rooms dimensions"],
     labels: Int[np.ndarray, " rooms"],
@@ -93,8 +76,9 @@ def cross_validated_predictions(
     seed: int,
     classify: Classify = linear,
     repeats: int = REPEATS,
-) -> CrossValidated:
-    """Classify each room with a classifier trained on the other folds.
+) -> tuple[Int[np.ndarray, " rooms"], Int[np.ndarray, " rooms"]]:
+    """Numbers of correct and of all predictions for each room, generated rooms first, by
+    classifiers trained on the other folds.
 
     The sets are features or small pictures, at least two rows each. Both contribute the same number
     of rooms to every training, so that a constant prediction has accuracy 0.5.
@@ -118,7 +102,7 @@ def cross_validated_predictions(
             answers = classify(inputs[rows[train]], labels[train], inputs[others], fold_seed)
             right[others] += answers == labels[held_out]
             asked[others] += 1
-    return CrossValidated(right[:n], asked[:n], right[n:], asked[n:])
+    return right, asked
 
 
 def check_alexnet(path: Path) -> None:
@@ -220,10 +204,13 @@ def _accuracy(
     kind: str, rooms: RoomSet, comparison: Comparison, classify: Classify, repeats: int
 ) -> Estimate:
     test = comparison.test
-    predictions = cross_validated_predictions(
+    right, asked = cross_validated_predictions(
         rooms.features(kind), test.features(kind), comparison.seed, classify, repeats
     )
-    return predictions.accuracy(rooms.counts, test.counts)
+    n = len(rooms.scenes)
+    # Both sets have the same weight.
+    generated = ratio(right[:n], asked[:n], rooms.counts)
+    return mean_of_shares(generated, ratio(right[n:], asked[n:], test.counts))
 
 
 @metric("sca", "SCA (AlexNet)", "", "half", PICTURED, "alexnet")

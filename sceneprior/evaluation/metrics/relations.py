@@ -5,8 +5,7 @@ They detect, for example, a nightstand far from every bed, which metrics of sing
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -35,8 +34,7 @@ LISTED = 10
 """Number of pairs in the table of pairs."""
 
 
-@dataclass(frozen=True)
-class Gaps:
+class Gaps(NamedTuple):
     """Gaps from the objects of one class to the nearest object of another."""
 
     gaps_m: Float[np.ndarray, " objects"]
@@ -101,8 +99,7 @@ def wasserstein(
     return np.asarray(np.abs(difference) @ steps)
 
 
-@dataclass(frozen=True)
-class PairDistances:
+class PairDistances(NamedTuple):
     """Wasserstein distance in metres between a set's gaps and the test rooms' gaps, per pair of
     classes."""
 
