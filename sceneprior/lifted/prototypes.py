@@ -1,8 +1,8 @@
 """Prototype shapes: a few objects of a data set that, mirrored and turned, represent all others.
 
-A look is a prototype shape in one of its `POSES`. It is stored as one number, prototype * POSES +
-pose, where pose p mirrors the prototype (x reversed) if p >= 4 and then turns it about +y by p % 4
-quarter turns.
+A posed prototype, or look, is a prototype shape in one of its `POSES`. It is stored as one number,
+prototype * POSES + pose, where pose p mirrors the prototype (x reversed) if p >= 4 and then turns
+it about +y by p % 4 quarter turns.
 """
 
 from typing import NamedTuple

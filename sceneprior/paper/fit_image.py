@@ -73,15 +73,15 @@ def decode_images(
     trained: TrainedPrior,
     points: Float[Tensor, "images width"],
     views: SceneViews,
-    with_grids: bool = True,
+    with_shapes: bool = True,
 ) -> DecodedScenes:
     """Decode from each latent as many objects as the fullest image shows.
 
-    Shapes are decoded, too, unless the run has only trained its layout stage. If `with_grids` is
-    false, looks are not decoded: they are not compared with masks, so the fit does not need them.
+    Shapes are decoded, too, unless the run has only trained its layout stage. If `with_shapes` is
+    false, only meshes are decoded: other shapes are not compared with masks.
     """
     z = trained.prior.latent_space.onto(points)
-    with_shape = trained.stage != "layout" and (with_grids or trained.prior.faces is not None)
+    with_shape = trained.stage != "layout" and (with_shapes or trained.prior.faces is not None)
     return trained.prior.decode(z, with_shape, wanted=views.is_object)
 
 
@@ -119,7 +119,7 @@ def fit_latents_to_images(
 ) -> Fit:
     """Fit one latent per image with RMSProp on its view loss, and return the best latent found.
 
-    Masks of looks are not rendered, so with looks only classes and 2D boxes are fitted.
+    Only deformed meshes are rendered: with other shapes, classes and 2D boxes alone are fitted.
 
     The fit moves z itself and projects it onto the sphere before each decoding. Training moves the
     logits instead, but logits only reach points between the anchors, and reach them slowly. The
@@ -141,7 +141,7 @@ def fit_latents_to_images(
         if step == schedule.drop_at:
             rate = rate.clamp(max=schedule.learning_rate * schedule.decay)
         x = points[active].requires_grad_()
-        scenes = decode_images(trained, x, seen, with_grids=False)
+        scenes = decode_images(trained, x, seen, with_shapes=False)
         loss = view_loss(trained, scenes, seen, masks)
         gains = loss.score < best[active] * (1 - schedule.least_gain)
         stalled[active] = torch.where(gains, 0, stalled[active] + 1)

@@ -25,7 +25,7 @@ from sceneprior.render.pictures import contact_sheet, gif_bytes, png_bytes
 from sceneprior.render.topdown import corner_view, perspective
 
 STEPS = 129
-"""Number of points on a path at which looks are decoded, to find the range in which each holds."""
+"""Number of points on a path at which shapes are decoded, to find the range in which each holds."""
 TILE = (240, 320)
 """Height and width in pixels of a picture in the strip, and of the animation."""
 STRIP_COLUMNS = 9

@@ -76,8 +76,7 @@ class ScenePrior(nn.Module):
 
     @property
     def faces(self) -> Int[Tensor, "faces 3"] | None:
-        """Triangles that all decoded meshes share; None if shapes are looks
-        (`lifted/prototypes.py`)."""
+        """Triangles that all decoded meshes share; None for other shapes."""
         return self.shape.faces
 
     def forward(
@@ -92,7 +91,7 @@ class ScenePrior(nn.Module):
         with_shape: bool | Bool[Tensor, "rooms shaped"] = True,
         wanted: Bool[Tensor, "rooms wanted"] | None = None,
     ) -> DecodedScenes:
-        """Decode rooms from points of the latent space; `with_shape` adds meshes or looks.
+        """Decode rooms from points of the latent space; `with_shape` adds shapes.
 
         If `with_shape` is a tensor, it selects the objects that get a mesh; all vertices of the
         other objects lie at the centre of their box. `wanted` limits what is decoded: as many

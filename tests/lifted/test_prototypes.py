@@ -42,16 +42,6 @@ def test_one_object_in_all_its_poses_is_one_prototype():
         assert np.allclose(shown[pose][:-3], pooled(grids[pose : pose + 1], 4).ravel())
 
 
-def test_other_classes_and_other_sizes_are_other_prototypes():
-    grids = np.stack([ODD] * 9)
-    sizes = np.stack([SIZE] * 6 + [2 * SIZE] * 3)
-    labels = np.array([1] * 3 + [2] * 6)
-    items, _ = choose_prototypes(grids, sizes, labels, np.ones(9, dtype=bool), most=99)
-    assert sorted(labels[items].tolist()) == [1, 2, 2]
-    fewer, _ = choose_prototypes(grids, sizes, labels, np.ones(9, dtype=bool), most=1)
-    assert sorted(labels[fewer].tolist()) == [1, 2]  # one a class stays
-
-
 def test_an_odd_shape_is_a_prototype_but_no_common_one():
     grids = np.stack([ODD] * 3 + [~ODD] * 2)
     sizes, labels = np.stack([SIZE] * 5), np.ones(5, dtype=np.int64)

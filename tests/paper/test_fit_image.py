@@ -54,9 +54,6 @@ def test_images_that_do_not_move_stop_early_and_others_go_on(trained, views, sta
     fit = fit_latents_to_images(trained, views, start, hopeless)
     # Nothing gains 200%: down at the first check, done at the second.
     assert fit.steps.tolist() == [40] * len(start)
-    eager = fit_latents_to_images(trained, views, start, replace(hopeless, patience=0))
-    assert eager.steps.tolist() == [60] * len(start)
-    assert (eager.loss.score <= fit.loss.score + 1e-6).all()
 
 
 def test_more_objects_than_the_prior_generates(trained, views, start):

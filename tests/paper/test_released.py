@@ -7,7 +7,6 @@ from torch.nn import functional as F
 from torch.testing import assert_close
 
 from sceneprior.paper.decoders import SeparateHeads
-from sceneprior.paper.layers import QuerySelfAttention
 from sceneprior.paper.transformer import SceneTransformer, TransformerConfig
 
 
@@ -30,20 +29,6 @@ def released_decoder(width=24, steps=7) -> SceneTransformer:
 
 def points(torch_rng, rooms=3, width=24) -> torch.Tensor:
     return F.normalize(torch.randn(rooms, width, generator=torch_rng, dtype=torch.float64), dim=-1)
-
-
-def test_query_self_attention_drops_whole_heads_in_training(torch_rng):
-    torch.manual_seed(0)
-    model = QuerySelfAttention(24, 3, 0.5)
-    z = torch.randn(400, 24, generator=torch_rng)
-    seen = []
-    model.out.register_forward_pre_hook(lambda layer, inputs: seen.append(inputs[0]))
-    model(z)
-    heads = seen[0].unflatten(-1, (3, 8)) / model.value(z).unflatten(-1, (3, 8))
-    assert_close(heads, heads[..., :1].expand_as(heads))  # a head as a whole ...
-    share = (heads[..., 0] == 0).float().mean()
-    assert 0.4 < share < 0.6  # ... half of them
-    assert_close(heads[heads != 0].mean(), torch.tensor(2.0))
 
 
 def test_a_step_is_torchs_encoder_and_decoder_layer_their_norms_and_the_steps_mlp(torch_rng):

@@ -92,10 +92,3 @@ def test_more_objects_than_slots_says_what_to_set(batch):
     boxes = type(batch.boxes)(batch.boxes.boxes[:, :, :3], batch.boxes.in_frustum[:, :, :3])
     with refused("paper/more objects than predictions", ValueError):
         match_objects(few, boxes, batch.views)
-
-
-def test_a_prediction_that_is_no_number_is_left_to_the_loss_to_report(batch):
-    boxes = batch.boxes.boxes.clone()
-    boxes[0, :, 1] = torch.nan
-    matches = match_objects(batch.scenes, batch.boxes._replace(boxes=boxes), batch.views)
-    assert sorted(matches.prediction[0].tolist()) == [0, 1, 2, 3]

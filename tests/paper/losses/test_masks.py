@@ -1,13 +1,16 @@
-"""The mask term: gate, averages, gradients, and no jump where a mask is all but certain."""
+"""The mask term: gate, averages, gradients, certain pixels; and the losses of each room alone."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 import torch
 from references import losses as by_hand
+from torch import Tensor
+from torch.testing import assert_close
 
-from sceneprior.paper.losses import mask_loss
-from sceneprior.paper.matching import match_objects
+from sceneprior.core.cameras import Boxes2D
+from sceneprior.paper.losses import layout_losses, mask_loss, mean_of_objects
+from sceneprior.paper.matching import Matches, match_objects
 
 
 def masks(batch, seed=0, sharp=1.0):
@@ -91,7 +94,35 @@ def test_certain_masks_pull_no_harder_than_doubtful_ones(batch):
         assert 0 < leaf.grad.abs().max() < 10
 
 
-def test_views_without_images_are_an_error_that_says_so(batch):
-    rendered, matches = masks(batch)
-    with pytest.raises(ValueError, match="These views have no instance ids; load the data"):
-        mask_loss(rendered, replace(batch.views, instance_ids=None), matches)
+def only(thing, room: int):
+    """The same batch, of one room."""
+    changes = {
+        item.name: getattr(thing, item.name)[room : room + 1]
+        for item in fields(thing)
+        if isinstance(getattr(thing, item.name), Tensor)
+    }
+    return replace(thing, **changes)
+
+
+def test_layout_terms(batch):
+    matches = match_objects(batch.scenes, batch.boxes, batch.views)
+    found = layout_losses(batch.scenes, batch.boxes, batch.views, matches, 0.3, None)
+    for room in range(3):
+        alone = layout_losses(
+            only(batch.scenes, room),
+            Boxes2D(*(part[room : room + 1] for part in batch.boxes)),
+            only(batch.views, room),
+            Matches(*(part[room : room + 1] for part in matches)),
+            0.3,
+        )
+        assert alone.keys() - {"completeness"} == found.keys()
+        for name, value in found.items():
+            assert value.shape == (3,)
+            assert_close(value[room], alone[name], rtol=1e-6, atol=1e-9)
+
+
+def test_a_room_without_anything_that_counts_is_zero():
+    values = torch.tensor([[1.0, 3.0], [5.0, 7.0]])
+    counted = torch.tensor([[True, True], [False, False]])
+    assert mean_of_objects(values, counted, per_room=True).tolist() == [2.0, 0.0]
+    assert mean_of_objects(values, counted).item() == 2.0
