@@ -5,6 +5,7 @@ reader who doubts a number can run the command again.
 """
 
 import contextlib
+import gc
 import os
 import resource
 import shlex
@@ -108,14 +109,16 @@ def call(main: Main, arguments: list[str], log: Path | None) -> None:
     threads = torch.get_num_threads()
     with contextlib.ExitStack() as until_done:
         until_done.callback(torch.set_num_threads, threads)  # `fit` may have changed it
+        until_done.callback(gc.collect)  # trainers and networks refer to each other
         if log is not None:
             output = until_done.enter_context(log.open("w"))
             until_done.enter_context(contextlib.redirect_stdout(output))
             until_done.enter_context(contextlib.redirect_stderr(output))
         try:
             status = main(arguments)
-        except InputError:
-            raise
+        except (InputError, FloatingPointError) as error:
+            print(f"Error: {error}", file=sys.stderr)
+            raise InputError(str(error)) from None
         except Exception as error:
             traceback.print_exc()
             raise InputError(f"{type(error).__name__}: {error}") from None

@@ -41,8 +41,7 @@ def run_demo(out: Path, config: str, rooms: int, count: int, main: Main) -> None
                     told += ["--command", f"sceneprior {shlex.join(earlier.arguments)}"]
             try:
                 run_command(main, command, out, unshown=told)
-            except InputError as error:
-                print(f"Error: {error}", file=sys.stderr)
+            except InputError:
                 raise InputError(
                     f"The demo stopped at '{command.name}'; fix the error and run it again."
                 ) from None

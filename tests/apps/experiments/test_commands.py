@@ -40,6 +40,7 @@ def test_a_failed_command_is_its_own_sentence_and_drops_what_came_after(version,
     command = Command("fail", ["inspect", "nowhere"], tmp_path / "no", depends_on=[])
     with pytest.raises(InputError, match="nowhere"):
         run_command(MAIN, command, tmp_path, tmp_path / "fail.log")
+    assert (tmp_path / "fail.log").read_text().startswith("Error: ")
     noted = json.loads((tmp_path / "steps.json").read_text())
     assert list(noted) == ["first", "fail"] and not noted["fail"]["finished"]
 
