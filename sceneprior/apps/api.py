@@ -6,6 +6,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
@@ -101,7 +102,7 @@ class Prior:
         count: int = 1,
         seed: int = 0,
         distribution: str | None = None,
-        floor: str | Sequence[Any] | None = None,
+        floor: str | Sequence[Any] | np.ndarray | None = None,
         openings: str | Sequence[Any] | None = None,
         ceiling_m: float | None = None,
         want: str | Mapping[str, Any] | None = None,
@@ -171,20 +172,19 @@ class Prior:
         scene: Scene,
         count: int = 4,
         seed: int = 0,
-        distribution: str | None = None,
         classes: Sequence[str] | None = None,
         want: str | Mapping[str, Any] | None = None,
-        floor: str | Sequence[Any] | None = None,
+        floor: str | Sequence[Any] | np.ndarray | None = None,
         openings: str | Sequence[Any] | None = None,
         ceiling_m: float | None = None,
         cad: bool = False,
     ) -> list[Scene]:
-        """Complete a partly furnished room; the given objects stay unchanged.
+        """Complete a partly furnished room by the prior's sampler; given objects stay unchanged.
 
         Args:
             scene: The given objects and, optionally, the floor, doors, windows and ceiling.
             count: Number of completions.
-            classes: Classes of the objects to add, and no others; only for priors with a sampler.
+            classes: Classes of the objects to add, and no others.
             want: Wishes for the whole room, as in `sample`.
             floor: Requested floor, as in `sample`, in the coordinates of the given objects. It
                 replaces the scene's floor with its doors, windows and ceiling.
@@ -193,8 +193,8 @@ class Prior:
             cad: Replace decoded meshes by models of the package's own furniture, as in `sample`.
 
         Raises:
-            InputError: an object cannot be used, or there are more objects than the prior
-                generates.
+            InputError: an object cannot be used, there are more objects than the prior generates,
+                or the prior has no sampler.
 
         Examples:
             >>> from sceneprior.core.scene import SceneObject
@@ -216,7 +216,7 @@ class Prior:
             own |= {"floor": scene.floor_m, "openings": scene.openings or None}
             own |= {"ceiling_m": scene.ceiling_m}
         request = request_of({**own, **asked})
-        rooms = sample_rooms(self.trained, count, seed, distribution, request, "complete", classes)
+        rooms = sample_rooms(self.trained, count, seed, None, request, "complete", classes)
         rooms = self._told(rooms, seed=seed)
         return _with_models(rooms, scene.objects) if cad else rooms
 

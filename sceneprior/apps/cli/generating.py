@@ -96,11 +96,10 @@ def complete(
     seed: options.Seed = 0,
     classes: Annotated[
         str | None,
-        typer.Option(help="Classes of the objects to add: double_bed,nightstand (samplers only)."),
+        typer.Option(help="Classes of the objects to add: double_bed,nightstand."),
     ] = None,
     asked: Any = None,
     cad: options.Cad = False,
-    distribution: options.Distribution = None,
     shell: options.Shell = None,
     overwrite: options.Overwrite = False,
 ) -> None:
@@ -121,7 +120,7 @@ def complete(
     scene = replace(scene, objects=(*scene.objects, *asked.pop("objects", ())))
     wanted = None if classes is None else [label.strip() for label in classes.split(",")]
     prior = load(run)
-    scenes = prior.complete(scene, count, seed, distribution, wanted, **asked, cad=cad)
+    scenes = prior.complete(scene, count, seed, wanted, **asked, cad=cad)
     write_scenes(scenes, out, drawn)
     options.note_unmet(scenes)
     given_objects = f"{len(scene.objects)} given object{'s' * (len(scene.objects) != 1)}"

@@ -15,8 +15,7 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene
 from sceneprior.core.shell import SHELLS, ShellName
 from sceneprior.interchange.export import SIMULATORS, export_scenes
-from sceneprior.lifted.requests.floors import read_floor
-from sceneprior.lifted.requests.openings import read_openings
+from sceneprior.lifted.requests.request import RoomRequest
 from sceneprior.render.scene_files import check_names, save
 
 if TYPE_CHECKING:
@@ -268,15 +267,7 @@ class RequestFields:
         Raises:
             InputError: a field cannot be read.
         """
-        asked = dict(self._rest)
-        if floor := self.text("floor"):
-            read_floor(floor)  # raises if the text is not a floor, as it might then name a file
-            asked["floor"] = floor
-        if openings := self.text("openings").strip(","):
-            read_openings(openings)
-            asked["openings"] = openings
-        if want := self.text("want"):
-            asked["want"] = want
+        asked = self._rest | {key: text for key in self.fields if (text := self.text(key))}
         if ceiling := self.text("ceiling_m").removesuffix("m"):
             try:
                 asked["ceiling_m"] = float(ceiling)
@@ -284,7 +275,7 @@ class RequestFields:
                 raise InputError(
                     f"The ceiling is '{ceiling[:40]}'; expected its height in metres, such as 2.6."
                 ) from None
-        return asked
+        return RoomRequest.of(**asked).parts()
 
     def clear(self) -> None:
         """Empty all fields, and drop the parts without a field."""
