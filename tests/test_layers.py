@@ -41,7 +41,7 @@ MAY_TOO = {
 
 BUDGET = {
     "data_prep": (13743, 110),
-    "sceneprior/core": (5745, 32),
+    "sceneprior/core": (5735, 32),
     "sceneprior/furniture": (586, 4),
     "sceneprior/render": (4552, 27),
     "sceneprior/training": (929, 9),

@@ -136,16 +136,6 @@ def intersection_volumes(
     return np.asarray(np.clip(high - low, 0, None).prod(2))
 
 
-def shared_of_smaller(a: Scene, b: Scene) -> Float[np.ndarray, "n m"]:
-    """Intersection of each box of a with each box of b, as a share of the smaller box, in [0, 1].
-
-    The share is 0 if one of the two boxes has no volume.
-    """
-    shared = intersection_volumes(a.centers_m, a.sizes_m, b.centers_m, b.sizes_m)
-    smaller = np.minimum(a.sizes_m.prod(1)[:, None], b.sizes_m.prod(1)[None])
-    return np.divide(shared, smaller, out=np.zeros_like(shared), where=smaller > 0)
-
-
 def box_iou_3d(
     centers_a: Float[np.ndarray, "n 3"],
     sizes_a: Float[np.ndarray, "n 3"],

@@ -9,7 +9,6 @@ from scipy.spatial import ConvexHull
 from torch.testing import assert_close
 
 from sceneprior.core.boxes import (
-    BOX_EDGES,
     CUBE_CORNERS,
     QUARTERS,
     box_corners,
@@ -27,18 +26,6 @@ def test_box_corners_are_center_plus_minus_half_a_size():
     ]
     assert_close(box_corners(center, size), torch.tensor(by_hand))
     assert box_corners(torch.zeros(2, 5, 3), torch.ones(2, 5, 3)).shape == (2, 5, 8, 3)
-
-
-def test_numpy_and_torch_give_the_same_corners(rng):
-    centers, sizes = rng.normal(size=(4, 2, 3)), rng.random((4, 2, 3))
-    in_torch = box_corners(torch.from_numpy(centers), torch.from_numpy(sizes))
-    np.testing.assert_array_equal(box_corners(centers, sizes), in_torch.numpy())
-
-
-def test_edges_join_corners_that_differ_in_one_coordinate():
-    corners = box_corners(np.array([1.0, 2, 3]), np.array([2.0, 4, 6]))
-    lengths = sorted(np.linalg.norm(corners[a] - corners[b]) for a, b in BOX_EDGES)
-    assert lengths == [2] * 4 + [4] * 4 + [6] * 4
 
 
 def test_a_yaw_turns_z_towards_x():
@@ -89,12 +76,6 @@ def test_to_cube_lands_on_the_cube_in_the_same_direction(level):
     assert_close(cube / cube.norm(dim=-1, keepdim=True), sphere, rtol=0, atol=1e-6)
     assert_close(cube.amin(dim=0), -torch.ones(3), rtol=0, atol=1e-6)
     assert_close(cube.amax(dim=0), torch.ones(3), rtol=0, atol=1e-6)
-
-
-def test_a_beveled_cube_without_bevels_is_the_cube():
-    vertices = beveled_cube(torch.zeros(2, 5, 2))
-    assert vertices.shape == (2, 5, 32, 3)
-    assert {tuple(v) for v in vertices[1, 3].tolist()} == set(itertools.product((-1, 1), repeat=3))
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """Label sets, the classes of models, colours, and seeds."""
 
-import json
-
 import numpy as np
 import pytest
 
@@ -9,7 +7,7 @@ import sceneprior
 from sceneprior.apps.config import load_config
 from sceneprior.core.classes import LABEL_SETS, class_colors, label_set, label_set_name
 from sceneprior.core.errors import ConfigError, InputError
-from sceneprior.core.furniture import class_of_category, model_categories
+from sceneprior.core.furniture import class_of_category
 from sceneprior.core.repeatable import LARGEST_SEED, check_seed
 from sceneprior.core.scene import Scene
 from sceneprior.render.appearance import quiet_colors
@@ -67,26 +65,6 @@ def test_a_class_has_one_colour_in_all_label_sets_and_unknown_names_have_one_too
 )
 def test_classes_of_categories(category, name, wanted):
     assert class_of_category(category, name) == wanted
-
-
-def test_categories_are_tidied_and_damage_is_a_sentence(tmp_path):
-    with pytest.raises(InputError, match=r"No folder at .*; --models names the folder"):
-        model_categories(tmp_path / "none", "--models")
-    with pytest.raises(InputError, match=r"has no model_info\.json .* --models usually ends in"):
-        model_categories(tmp_path, "--models")
-    path = tmp_path / "model_info_revised.json"
-    rows = [
-        {"model_id": "a", "category": "Sideboard / Side Cabinet / Console Table"},
-        {"model_id": "b", "category": None},
-    ]
-    path.write_text(json.dumps(rows))
-    assert model_categories(tmp_path) == {
-        "a": "sideboard/side cabinet/console table",
-        "b": "others",
-    }
-    path.write_text(json.dumps([{"category": "Bed"}]))
-    with pytest.raises(InputError, match="is not 3D-FUTURE's list of models"):
-        model_categories(tmp_path)
 
 
 TWENTY_DIGITS = 10**20 - 1

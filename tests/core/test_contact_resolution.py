@@ -32,19 +32,6 @@ def deepest_overlap(scene: Scene) -> float:
     return worst
 
 
-def test_floating_and_sunken_objects_are_set_down():
-    scene, told = standing(
-        solid_box("desk", (0, 0.45, 0), (1, 0.8, 1)),
-        solid_box("sofa", (3, 0.3, 0), (1, 0.8, 1)),
-        solid_box("pendant_lamp", (0, 2, 0), (0.4, 0.4, 0.4)),
-        solid_box("shelf", (3, 1.5, 2), (1, 0.3, 0.3)),  # at a wall
-        solid_box("stool", (-2, 2.5, 0), (0.4, 0.4, 0.4)),
-        solid_box("stool", (0, 1.05, 0), (0.8, 0.4, 0.2)),
-    )
-    assert told == {"set down": 4}
-    np.testing.assert_allclose(scene.centers_m[:, 1], [0.4, 0.4, 2, 1.5, 0.2, 1.0], atol=1e-9)
-
-
 def test_a_table_on_one_side_gets_feet_and_keeps_its_solids():
     board = Solid("box", (-0.5, 0.7, -0.5), (0.5, 0.75, 0.5))
     leg = Solid("cylinder", (-0.5, 0.0, -0.1), (-0.3, 0.7, 0.1))
@@ -96,12 +83,6 @@ def test_pushed_objects_leave_doors_free():
         shared = swing.intersection(shapely.box(*low[::2], *high[::2])).area
         assert told["moved"] == 1 and (shared < 1e-3) == free
     assert deepest_overlap(moved) == 0
-
-
-def test_without_a_free_place_an_object_is_left_out():
-    wall_to_wall = solid_box("double_bed", (0, 0.5, 0), (9, 1, 9))
-    scene, told = standing(wall_to_wall, solid_box("chair", (0, 0.5, 0), (1, 1, 1)))
-    assert told == {"left out": 1} and len(scene.objects) == 1
 
 
 def test_turned_boxes_are_bodies_at_their_angle():

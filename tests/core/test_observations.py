@@ -58,15 +58,6 @@ def test_void_is_no_object_and_hides_what_is_behind_it():
     np.testing.assert_array_equal(seen.boxes[0, 0], np.float32([0, 0, 0.25, 1]))
 
 
-def test_void_after_255_objects_needs_two_bytes_and_only_where_it_is_seen():
-    image = np.repeat(np.arange(1, 257, dtype=np.uint16), 5)[None, None].repeat(6, axis=1)
-    classes = [True] * 255 + [False]
-    assert observe(image, classes).instance_ids.dtype == np.uint16
-    np.testing.assert_array_equal(observe(image, classes).instance_ids, image)
-    image[image == 256] = 0
-    assert observe(image, classes).instance_ids.dtype == np.uint8
-
-
 def test_boxes_are_tight_round_masks():
     rng = np.random.default_rng(1)
     image = np.kron(rng.integers(0, 4, (6, 8)), np.ones((7, 7), int)).astype(np.uint16)

@@ -40,16 +40,6 @@ def test_rooms_are_found_in_either_split(toy_shards):
         image_from_shards(toy_shards, "attic", 0)
 
 
-def test_views_are_drawn_by_the_seed_room_by_room(toy_shards):
-    images, blank = images_of_split(toy_shards, "test", 1)
-    again, _ = images_of_split(toy_shards, "test", 1, limit=2)
-    other, _ = images_of_split(toy_shards, "test", 2)
-    views = [image.view for image in images]
-    assert blank == [] and len(images) == 4
-    assert [image.view for image in again] == views[:2]
-    assert [image.view for image in other] != views
-
-
 def test_more_views_of_a_room_are_further_ones(toy_shards):
     one, _ = images_of_split(toy_shards, "test", 1)
     three, _ = images_of_split(toy_shards, "test", 1, views=3)

@@ -6,7 +6,6 @@ import trimesh
 from parts_of_rooms import CORNER, TABLE, boxes
 
 from sceneprior.core.parts import (
-    ACROSS_X,
     BOWL,
     BOX,
     CYLINDER,
@@ -25,20 +24,6 @@ CURVED = [
     for kind in (CYLINDER, ELLIPSOID, DOME, BOWL)
 ]
 VOLUMES = [np.pi / 4, np.pi / 6, np.pi / 6, np.pi / 6]
-
-
-def test_mirror_images_of_a_table_s_leg_stand_in_all_four_corners():
-    legs = [ends for _, ends in TABLE.solids()][1:]
-    corners = {tuple(np.sign(ends.mean(axis=1)[[0, 2]])) for ends in legs}
-    assert len(legs) == len(corners) == 4
-    assert all((ends[1] == legs[0][1]).all() for ends in legs)
-
-
-def test_cells_are_filled_where_points_are_inside():
-    cells = filled_cells(TABLE, 16, 1.0)
-    assert cells[:, 14:].all() and cells[:2, :, :2].all() and cells[-2:, :, -2:].all()
-    assert not cells[2:-2, :14].any()
-    assert not filled_cells(TABLE, 20, 1.25)[[0, 1, -2, -1]].any(), "beyond the box"
 
 
 @pytest.mark.parametrize(("parts", "share"), zip(CURVED, VOLUMES, strict=True))
@@ -68,12 +53,6 @@ def test_a_mesh_has_the_volume_of_the_cells():
         assert trimesh.Trimesh(vertices, faces).volume == pytest.approx(volume, rel=0.02)
 
 
-def test_parts_that_touch_in_an_edge_alone_are_still_a_closed_mesh():
-    parts = boxes((0, 32, 0, 32, 0, 64), (32, 64, 32, 64, 0, 64))
-    vertices, faces = surface_of_parts(parts)
-    assert trimesh.Trimesh(vertices, faces).is_watertight
-
-
 def test_legs_keep_their_thickness_and_tables_fill_their_new_box():
     size_m = np.array([0.8, 0.75, 0.4])
     wide_m = np.array([1.6, 0.75, 0.8])
@@ -87,13 +66,6 @@ def test_legs_keep_their_thickness_and_tables_fill_their_new_box():
     assert (inner - low)[1] == pytest.approx(62 / 64 * 0.75), "height is as before"
 
 
-def test_what_is_thin_throughout_is_stretched_as_a_whole():
-    board = boxes((0, 64, 0, 64, 0, 64))
-    points = np.random.default_rng(0).uniform(-0.5, 0.5, (9, 3))
-    found = Stretch.of(board, np.array([0.05, 1, 1])).moved(points, np.array([0.5, 2, 3]))
-    np.testing.assert_allclose(found, points)
-
-
 def test_stretching_keeps_the_order_of_points_and_meshes_closed():
     vertices, faces = surface_of_parts(TABLE)
     for new_m in ([2.0, 0.7, 0.5], [0.3, 0.2, 0.4]):
@@ -102,10 +74,3 @@ def test_stretching_keeps_the_order_of_points_and_meshes_closed():
             order = np.argsort(vertices[:, axis], kind="stable")
             assert (np.diff(moved[order, axis]) >= -1e-12).all()
         assert trimesh.Trimesh(moved, faces).is_watertight
-
-
-def test_a_part_mirrored_along_x_alone_has_two_solids():
-    pair = boxes((0, 8, 0, 64, 10, 20), mirrored=(ACROSS_X,))
-    one, other = (ends for _, ends in pair.solids())
-    np.testing.assert_array_equal(other[0], -one[0, ::-1])
-    np.testing.assert_array_equal(other[1:], one[1:])

@@ -113,16 +113,6 @@ def test_shards_of_version_1_are_read_and_those_of_the_future_are_not(tmp_path):
         Shard(tmp_path / "a.h5")
 
 
-def test_a_failure_midway_leaves_nothing(tmp_path, monkeypatch):
-    def full_disk(*_):
-        raise OSError("No space left on device")
-
-    monkeypatch.setattr("sceneprior.core.shard_writing._write_room", full_disk)
-    with pytest.raises(OSError, match="No space"):
-        write_shard(tmp_path / "a.h5", "front3d_bedroom", [(make_room(), None)])
-    assert not list(tmp_path.iterdir())
-
-
 def test_damaged_pixels_name_the_room(tmp_path):
     path = tmp_path / "a.h5"
     write_shard(path, "front3d_bedroom", [(make_room(size=(120, 160)), make_truth())])
@@ -173,24 +163,3 @@ def test_shards_of_before_have_no_checksum(tmp_path):
         for read in (shard.read_checksum, shard.has_ground_truth):
             with pytest.raises(ShardError, match="room nowhere cannot be read"):
                 read("nowhere")
-
-
-def test_the_turn_of_a_room_is_an_attribute_of_turned_rooms_only(tmp_path):
-    path, matrix = tmp_path / "a.h5", np.eye(4)
-    matrix[:3, 3] = 0.1, 0.2, 0.3
-    room = make_room()
-    turned = replace(room, room_id="turned", turned_deg=-33.25, room_from_world=matrix)
-    write_shard(path, "front3d_bedroom", [(room, None), (turned, None)])
-    assert room_checksum(turned, None) != room_checksum(replace(turned, turned_deg=1.0), None)
-    with Shard(path) as shard:
-        assert_same(shard.read_room("turned", images=True), turned)
-        read = shard.read_room("turned", images=True)
-        assert shard.read_checksum("turned") == room_checksum(read, None)
-    with h5py.File(path, "a") as file:
-        assert set(file["rooms/house_A"].attrs) == {"room_id", "image_size", "sha256"}
-        file["rooms/turned"].attrs["room_from_world"] = np.full((4, 4), np.nan)
-    message = (
-        r"room turned cannot be read \(turned_deg -33\.25 and room_from_world .* are no turn\)"
-    )
-    with Shard(path) as shard, pytest.raises(ShardError, match=message):
-        shard.read_room("turned")

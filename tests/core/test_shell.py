@@ -88,11 +88,3 @@ def test_walls_stand_clear_of_furniture(outline):
     np.testing.assert_allclose(shell.outline_m.max(axis=0), [2.9, high[1]])
     (wall,) = (wall for wall in shell.walls if wall.openings)
     assert wall.outward.tolist() == [1, 0] and wall.start_m[0] == pytest.approx(2.9)
-
-
-def test_the_ceiling_is_given_or_above_the_furniture():
-    lamp = solid_box("ceiling_lamp", (0, 2.7, 0), (0.4, 0.2, 0.4))
-    tall = solid_box("wardrobe", (0, 1.4, 0), (1, 2.8, 0.6))
-    assert shell_of(room(SQUARE, lamp)).height_m == pytest.approx(2.8)
-    assert shell_of(room(SQUARE, tall)).height_m == pytest.approx(2.85)
-    assert shell_of(room(SQUARE, tall, ceiling_m=2.5)).height_m == 2.5

@@ -56,19 +56,6 @@ def test_surfaces_are_closed_outward_and_of_few_faces(rng, noise):
         assert mesh.volume == pytest.approx(4 / 3 * np.pi * 0.4**3 * SIZE.prod(), rel=0.01)
 
 
-def test_what_fills_the_box_s_corner_has_a_sharp_one():
-    """The lower half of the box, and a quarter of the rest."""
-    grid = np.full((22, 22, 22), -4.0)
-    grid[1:-1, 1:11, 1:-1] = 4.0
-    grid[1:11, 11:-1, 1:11] = 4.0
-    vertices, faces = surface_of(grid, CENTER, SIZE, 1.1)
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    assert is_closed(faces) and mesh.volume == pytest.approx(0.625 * SIZE.prod(), rel=0.01)
-    signs = np.array([[-1, -1, -1], [1, -1, -1], [1, -1, 1], [-1, -1, 1], [-1, 1, -1]])
-    for corner in CENTER + signs * SIZE / 2:
-        assert np.abs(vertices - corner).max(axis=1).min() < 1e-6
-
-
 def test_small_pieces_are_dropped_and_large_ones_stay():
     def with_piece(size):
         piece = block([0.5, 0.2, 0.1], np.array([0.5, 0.2, 0.1]) + size)
