@@ -220,7 +220,8 @@ def added(agreements: Iterable[Agreement]) -> Agreement:
     for agreement in agreements:
         for kind, tally in agreement.items():
             before = total.get(kind, Tally(kind))
-            total[kind] = Tally(kind, *map(sum, zip(before[1:], tally[1:], strict=True)))
+            sums = (a + b for a, b in zip(before[1:], tally[1:], strict=True))
+            total[kind] = Tally._make((kind, *sums))
     return {kind: total[kind] for kind in KINDS if kind in total}
 
 
@@ -259,7 +260,7 @@ class Comparison(NamedTuple):
                 held, whole = self.held & judged, self.whole & judged
                 iou = float(self.iou[whole].sum())
                 counts = (int(flags.sum()) for flags in (judged, held, whole))
-                tallies[kind] = Tally(kind, *counts, iou)
+                tallies[kind] = Tally._make((kind, *counts, iou))
         return tallies
 
 
