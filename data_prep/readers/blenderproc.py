@@ -73,7 +73,6 @@ class BlenderProc(Reader):
         return self.recipe.name
 
     def options(self) -> dict[str, Any]:
-        """See `Reader.options`."""
         models = sorted(_categories(self.folder).items(), key=repr)
         return {
             **super().options(),
@@ -83,7 +82,6 @@ class BlenderProc(Reader):
         }
 
     def scenes(self) -> list[str]:
-        """See `Reader.scenes`."""
         return sorted(path.name for path in self.folder.iterdir() if any(path.glob("*.hdf5")))
 
     def rooms(self, scene: str) -> dict[str, FoundRoom]:

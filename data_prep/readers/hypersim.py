@@ -42,12 +42,10 @@ class Hypersim(Reader):
     name: ClassVar = "hypersim"
 
     def options(self) -> dict[str, Any]:
-        """See `Reader.options`."""
         _camera_rows(self.folder / CAMERAS)
         return super().options()
 
     def scenes(self) -> list[str]:
-        """See `Reader.scenes`."""
         return sorted(
             path.name
             for path in self.folder.iterdir()
@@ -59,7 +57,6 @@ class Hypersim(Reader):
         return {scene: FoundRoom(_camera(self.folder / CAMERAS, scene)[0])}
 
     def read(self, task: RoomTask) -> FramedRoom:
-        """See `Reader.read`."""
         scene = self.folder / task.house
         size, cam_from_uv = _camera(self.folder / CAMERAS, task.house)
         intrinsics, tilt = pinhole(cam_from_uv, size)

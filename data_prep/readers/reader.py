@@ -138,7 +138,6 @@ class Reader(ABC):
         return str(self.splits or "the split, or give one with --splits")
 
     def settings(self, only: str | None) -> dict[str, Any]:
-        """See `Source.settings`."""
         options = self.options()
         return {"recipe": options, "seed": self.seed, **self.fingerprint(self._chosen(only))}
 

@@ -61,12 +61,10 @@ class ScanNet(Reader):
             raise InputError(f"masks is '{self.masks}'; choose {' or '.join(MASK_FILES)}.")
 
     def options(self) -> dict[str, Any]:
-        """See `Reader.options`."""
         names = ("frame_step", "max_views", "masks", "image_size")
         return {name: getattr(self, name) for name in names}
 
     def fingerprint(self, scenes: list[str]) -> dict[str, Any]:
-        """See `Reader.fingerprint`."""
         read_labels(self.labels)
         if self.train or self.val:
             split_scans(self.scenes(), self.train, self.val)

@@ -63,12 +63,10 @@ class ScanNetPP(Reader):
     name: ClassVar = "scannetpp"
 
     def options(self) -> dict[str, Any]:
-        """See `Reader.options`."""
         labels = digest(repr(sorted(_labels(self.folder).nyu40.items())))
         return {**super().options(), "labels": labels}
 
     def scenes(self) -> list[str]:
-        """See `Reader.scenes`."""
         return sorted(path.parents[1].name for path in self.folder.glob(f"*/{_MESH}"))
 
     def rooms(self, scene: str) -> dict[str, FoundRoom]:

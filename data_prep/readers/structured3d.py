@@ -79,7 +79,6 @@ class Structured3D(Reader):
     name: ClassVar = "structured3d"
 
     def scenes(self) -> list[str]:
-        """See `Reader.scenes`."""
         return sorted(
             path.name
             for path in self.folder.iterdir()
@@ -101,7 +100,6 @@ class Structured3D(Reader):
         return found
 
     def read(self, task: RoomTask) -> FramedRoom:
-        """See `Reader.read`."""
         scene = self.folder / task.house
         room = scene / "2D_rendering" / task.room_id.removeprefix(f"{task.house}_")
         views = _views(room)

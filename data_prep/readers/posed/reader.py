@@ -78,7 +78,6 @@ class Posed(Reader):
         return self.classes
 
     def options(self) -> dict[str, Any]:
-        """See `Reader.options`."""
         label_set(self.label_set)
         if not 0 <= self.test_share < 1:
             raise InputError(
@@ -105,7 +104,6 @@ class Posed(Reader):
         return {"test_share": self.test_share, "rooms": digest(repr(sorted(files.items())))}
 
     def scenes(self) -> list[str]:
-        """See `Reader.scenes`."""
         return [*self._folders()]
 
     def rooms(self, scene: str) -> dict[str, FoundRoom]:
@@ -115,7 +113,6 @@ class Posed(Reader):
         return {scene: FoundRoom(shrunk(of_frames[min(of_frames)].size(), self.max_side))}
 
     def split_rooms(self, rooms: Mapping[str, str]) -> tuple[dict[str, str], list[Line]]:
-        """See `Reader.split_rooms`."""
         drawn = seeded_split(rooms, self.seed, self.test_share)
         return {name: drawn[name] for name in rooms}, []
 
