@@ -104,7 +104,7 @@ def test_recordings_and_archives_cut_anywhere_are_refused_by_name(tmp_path):
     path = tmp_path / "a.sens"
     data = sens_bytes(poses(3), [b"colour"] * 3, (24, 32))
     tracemalloc.start()
-    for end in range(len(data)):
+    for end in {*range(0, len(data), 3), len(data) - 8, len(data) - 1}:
         path.write_bytes(data[:end])
         if end == len(data) - 8:  # the count of IMU records, of which we use none
             read_sens(path)
@@ -118,7 +118,7 @@ def test_recordings_and_archives_cut_anywhere_are_refused_by_name(tmp_path):
     tracemalloc.stop()
     masks = {f"instance-filt/{k}.png": png(mask(k)) for k in range(2)}
     data = write_zip(tmp_path / "a.zip", masks).read_bytes()
-    for end in range(len(data)):
+    for end in range(0, len(data), 3):
         (tmp_path / "cut.zip").write_bytes(data[:end])
         with pytest.raises(InputError, match=r"cut\.zip cannot be opened as a zip"):
             MaskArchive(tmp_path / "cut.zip")
