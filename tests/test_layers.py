@@ -43,7 +43,7 @@ BUDGET = {
     "data_prep": (13743, 110),
     "sceneprior/core": (5735, 32),
     "sceneprior/furniture": (586, 4),
-    "sceneprior/render": (4552, 27),
+    "sceneprior/render": (4554, 27),
     "sceneprior/training": (929, 9),
     "sceneprior/paper": (2710, 24),
     "sceneprior/lifted": (8880, 68),

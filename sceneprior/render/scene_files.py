@@ -28,7 +28,6 @@ from sceneprior.render.appearance import (
 from sceneprior.render.model_files import joined, load_parts
 from sceneprior.render.pictures import png_bytes
 from sceneprior.render.scene_simulators import scene_to_usd
-from sceneprior.render.topdown import floor_plan
 
 NO_SHELL: Mapping[str, Mesh] = {}
 PACKAGE_FORMATS = "sceneprior-"
@@ -75,6 +74,9 @@ def save(scene: Scene, path: Path | str, shell: ShellName = "none") -> None:
         case ".usda":
             write_whole(path, scene_to_usd(scene, shell_meshes(scene, shell)))
         case ".png":
+            # Imported here, since models need no z-buffer.
+            from sceneprior.render.topdown import floor_plan
+
             # Flat colours: runs alone are 8% larger than all repeats, in two thirds of the time.
             write_whole(path, png_bytes(floor_plan(scene), compress_type=zlib.Z_RLE))
         case suffix:
