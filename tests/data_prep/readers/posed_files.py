@@ -11,12 +11,9 @@ from PIL import Image
 from scan_files import BOX_FACES
 
 from data_prep.engine.source import PreparedRoom, RoomTask
-from data_prep.inspection.agreement import box_iou_2d, boxes_around, hull_of
 from data_prep.readers.posed.formats import read_formats
 from data_prep.readers.posed.reader import Posed
 from data_prep.readers.posed.recording import room_name
-from data_prep.readers.upright import own_sides
-from sceneprior.core.shards import RoomViews
 from sceneprior.render.offscreen.zbuffer import rasterize
 
 SET = "void,bed,chair"
@@ -137,22 +134,3 @@ def prepared(
     name = room_name(room.folder)
     made = reader.prepare(RoomTask(name, name, "train"), None)
     return made if isinstance(made, PreparedRoom) else None
-
-
-def in_room(room: PosedRoom, center: tuple[float, float] = (0.1, -0.2)) -> list[np.ndarray]:
-    """Corners of bed and chair in the room frame: (x, y, z) with z up -> (x, z, -y)."""
-    return [
-        np.stack([c[:, 0] - center[0], c[:, 2], -(c[:, 1] - center[1])], axis=1)
-        for c in (thing.corners for thing in room.things[:2])
-    ]
-
-
-def overlaps(views: RoomViews, corners: Sequence[np.ndarray]) -> np.ndarray:
-    """IoU of the boxes round projected corners (in the room frame) with those of whole masks."""
-    height, width = views.image_size
-    found = []
-    for k, points in enumerate(corners):
-        boxes = boxes_around(hull_of(points), views.world_to_camera, views.intrinsics)
-        iou = box_iou_2d(boxes, views.boxes[:, k] * np.array([width, height, width, height]))
-        found += iou[own_sides(views, views.image_size).all(axis=-1)[:, k]].tolist()
-    return np.array(found)

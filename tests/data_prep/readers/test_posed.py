@@ -25,7 +25,6 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.ground_truth import reference_scenes
 
 KEYS = {"floor_m": 0.0, "floor_center_m": [0.1, -0.2]}
-Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
 
 @pytest.fixture
