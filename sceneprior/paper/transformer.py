@@ -159,7 +159,7 @@ class SceneTransformer(nn.Module):
 
         Coordinates of a unit vector are about 1 / sqrt(width), far below the normalised features to
         which they are added, so z is scaled by sqrt(width). Without this scaling, the class loss
-        falls far more slowly (docs/experiments/2026-11-21-demo-settings.md).
+        falls far more slowly (git show 05a7b7d2:docs/experiments/2026-11-21-demo-settings.md).
         """
         return self.query(z * z.shape[-1] ** 0.5)
 
