@@ -4,7 +4,7 @@ Heavy imports are inside the functions, so that the command line starts quickly.
 """
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -97,7 +97,7 @@ def prep_front(
         changes.append(f"views.per_m2={views_per_m2}")
     rules = load_recipe(recipe, tuple(changes))
     source = FrontSource(front, future, rules, splits, seed, only)
-    run_job(source, out, workers, retry_failed, renderer)
+    run_job(source, out, workers, retry_failed=retry_failed, renderer=renderer)
 
 
 def recipe(
@@ -144,7 +144,7 @@ def prep_scannet(
         image_size=FULL_SIZE if full_size else QUARTER_SIZE, train=train_list, val=val_list,
         seed=seed, only=only,
     )  # fmt: skip
-    run_job(source, out, workers, retry_failed)
+    run_job(source, out, workers, retry_failed=retry_failed)
 
 
 def prep_posed(
@@ -256,7 +256,7 @@ def prep_dataset(
         name, folder, recipe, splits=splits, max_side=max_side, max_views=max_views, seed=seed,
         only=only,
     )  # fmt: skip
-    run_job(source, out, workers, retry_failed)
+    run_job(source, out, workers, retry_failed=retry_failed)
 
 
 def inspect(
@@ -319,21 +319,16 @@ def _verify(shards: Path, room: str | None, workers: int) -> None:
     typer.echo(f"{shards}: {summary(found)}")
 
 
-def run_job(
-    source: "Source",
-    out: Path,
-    workers: int | None,
-    retry_failed: bool = False,
-    renderer: str = "auto",
-) -> None:
-    """Build shards and print the report, for every `prep-*` command."""
+def run_job(source: "Source", out: Path, workers: int | None, **options: Any) -> None:
+    """Build shards and print the report, for every `prep-*` command; `options` are those of
+    `Job`."""
     from rich.console import Console
 
     from data_prep.engine.build import Job, build_shards
     from data_prep.engine.report import report_tables
 
     try:
-        summary = build_shards(Job(source, out, workers, renderer, retry_failed))
+        summary = build_shards(Job(source, out, workers, **options))
     except KeyboardInterrupt:
         typer.echo("Stopped; finished shards are kept. Run the same command to continue.", err=True)
         raise typer.Exit(130) from None
