@@ -12,9 +12,8 @@ from sceneprior.lifted.lifting import LiftedBoxes, RayPool, ShapeGrid
 from sceneprior.lifted.lifting.cache import LiftedCache
 from sceneprior.lifted.lifting.dataset import LiftedDataset
 from sceneprior.lifted.prototype_decoder import PrototypeConfig, PrototypeDecoder
-from sceneprior.lifted.sampler.network import RoomSampler
+from sceneprior.lifted.sampler.network import RoomSampler, SamplerConfig
 from sceneprior.lifted.sampler.rooms import SamplerRooms
-from sceneprior.lifted.sampler.settings import SamplerConfig
 from sceneprior.lifted.sampler.stage import teach
 
 CLASSES, CODES, CELLS, PROTOTYPES = 5, 7, 8, 12

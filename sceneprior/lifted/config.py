@@ -18,9 +18,8 @@ from sceneprior.lifted.lifting import ShapeGrid
 from sceneprior.lifted.lifting.dataset import LiftedDataset
 from sceneprior.lifted.losses import LiftedLossConfig
 from sceneprior.lifted.prototype_decoder import PrototypeConfig, PrototypeDecoder
-from sceneprior.lifted.sampler.network import RoomSampler
+from sceneprior.lifted.sampler.network import RoomSampler, SamplerConfig
 from sceneprior.lifted.sampler.rooms import SamplerRooms
-from sceneprior.lifted.sampler.settings import SamplerConfig
 from sceneprior.paper.prior import ModelConfig, PriorConfig, TrainedPrior
 from sceneprior.paper.settings import LatentStageConfig
 from sceneprior.paper.transformer import TransformerConfig

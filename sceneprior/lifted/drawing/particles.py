@@ -8,8 +8,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from sceneprior.lifted.drawing.plans import RoomPlans, read_rooms
+from sceneprior.lifted.sampler.encoder_state import EncoderState
 from sceneprior.lifted.sampler.network import RoomSampler
-from sceneprior.lifted.sampler.reading import Reading
 
 
 class Particles:
@@ -35,7 +35,7 @@ class Particles:
         """Rows of a room's particles."""
         return slice(room * self.each, (room + 1) * self.each)
 
-    def read(self, sampler: RoomSampler, rows: Int[Tensor, " some"], step: int) -> Reading:
+    def read(self, sampler: RoomSampler, rows: Int[Tensor, " some"], step: int) -> EncoderState:
         """The outputs of the sampler's encoder for some particles before a step."""
         room = self.room[rows]
         return read_rooms(

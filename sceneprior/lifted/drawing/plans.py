@@ -19,8 +19,8 @@ from sceneprior.lifted.requests.openings import place_openings
 from sceneprior.lifted.requests.request import Conditions
 from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.contents import END
+from sceneprior.lifted.sampler.encoder_state import EncoderState, Frame
 from sceneprior.lifted.sampler.network import RoomSampler
-from sceneprior.lifted.sampler.reading import Frame, Reading
 from sceneprior.lifted.sampler.rooms import rectangle_sides, rectangles_of
 
 RECTANGLES = 16
@@ -190,7 +190,7 @@ def read_rooms(
     number: Int[Tensor, " rooms"],
     rectangle_m: Float[Tensor, "rooms 4"],
     coming: Int[Tensor, "rooms wanted"],
-) -> Reading:
+) -> EncoderState:
     """Encode the first `number` objects of each room, and the classes still to come."""
     most = int(number.max())
     first = torch.arange(most, device=number.device) < number[:, None]
@@ -215,16 +215,16 @@ def _with_looks(
     assert rooms.looks is not None
     for step in range(known):
         number = torch.full((count,), step)
-        reading = read_rooms(sampler, rooms, number, rectangle_m, still[:, step:])
+        state = read_rooms(sampler, rooms, number, rectangle_m, still[:, step:])
         label = rooms.object_class[:, step]
         centre_m, size_m = rooms.boxes_m[:, step].split(3, dim=-1)
         off = size_m.log().unsqueeze(1) - sampler.look_shown[: sampler.looks, -3:]
-        logits = sampler.look_logits(reading, label)
+        logits = sampler.look_logits(state, label)
         logits = logits - off.square().sum(dim=-1) / (2 * SIZE_DOUBT**2)
         some = draw_index(logits.unsqueeze(1).expand(-1, LOOKS, -1), uniform[:, step, 1:])
         bottom_m = centre_m[:, 1] - size_m[:, 1] / 2
         fits = [
-            sampler.place(reading, label, look, size_m, bottom_m).log_prob(centre_m[:, ::2])
+            sampler.place(state, label, look, size_m, bottom_m).log_prob(centre_m[:, ::2])
             for look in some.unbind(dim=1)
         ]
         chosen = draw_index(torch.stack(fits, dim=1), uniform[:, step, 0])

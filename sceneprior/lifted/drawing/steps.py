@@ -10,14 +10,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sceneprior.core.mixtures import draw_index
-from sceneprior.lifted.drawing.overlaps import resolve_overlap, violation
 from sceneprior.lifted.drawing.particles import Particles
-from sceneprior.lifted.drawing.plans import RoomPlans
+from sceneprior.lifted.drawing.plans import BEYOND_M, RoomPlans
 from sceneprior.lifted.requests.relations import Furniture, furniture_of
 from sceneprior.lifted.requests.rules import PlacementRules
+from sceneprior.lifted.sampler.encoder_state import EncoderState, Frame
 from sceneprior.lifted.sampler.network import RoomSampler
 from sceneprior.lifted.sampler.places import Places
-from sceneprior.lifted.sampler.reading import Frame, Reading
+from sceneprior.lifted.sampler.rooms import GRAZE_M, shared_extents
 
 TRIES = 4
 """Places drawn for an object in each particle; the first allowed one is taken. With more, an object
@@ -31,6 +31,9 @@ COMPARED = 16
 FLUSH, ADJACENT = 0.5, 0.25
 """Probabilities, along each axis, that a candidate is flush with a side of a rectangle in the
 floor, and that it is adjacent to an object or flush with it."""
+INTERSECTING = 0.01
+"""Shared volume, relative to the smaller box, above which two boxes count as intersecting; the same
+as in the evaluation."""
 
 Rejections = Counter[tuple[int, str]]
 """Number of places rejected for an object, by its class and the reason."""
@@ -43,12 +46,12 @@ class Proposal(NamedTuple):
     look: Int[Tensor, " some"]
     size_m: Float[Tensor, "some 3"]
     bottom_m: Float[Tensor, " some"]
-    reading: Reading
+    state: EncoderState
     """Outputs of the encoder, in the frame of the rectangle in which each object is placed."""
 
     def rows(self, rows: Int[Tensor, " fewer"]) -> "Proposal":
         """Some of these objects."""
-        return Proposal(*(part[rows] for part in self[:-1]), self.reading.rows(rows))
+        return Proposal(*(part[rows] for part in self[:-1]), self.state.rows(rows))
 
     def boxes_m(self, place_m: Float[Tensor, "some 2"]) -> Float[Tensor, "some 6"]:
         """Boxes of the objects at places (x, z)."""
@@ -58,11 +61,11 @@ class Proposal(NamedTuple):
 
     def apart(self, sampler: RoomSampler) -> Bool[Tensor, "some objects"]:
         """Objects of each room that the new object must not intersect."""
-        return ~sampler.may_meet[self.label[:, None], self.reading.before.object_class]
+        return ~sampler.may_meet[self.label[:, None], self.state.before.object_class]
 
     def places(self, sampler: RoomSampler) -> Places:
         """The distribution of the objects' places."""
-        return sampler.place(self.reading, self.label, self.look, self.size_m, self.bottom_m)
+        return sampler.place(self.state, self.label, self.look, self.size_m, self.bottom_m)
 
 
 def place_next(
@@ -99,8 +102,8 @@ def place_next(
         own = found.rows(waiting)
         z_numbers = numbers[waiting, 5 + 4 * number : 7 + 4 * number]
         boxes_m = own.boxes_m(places.rows(waiting).draw(x[waiting, number], z_numbers))
-        boxes_m = resolve_overlap(boxes_m, own.reading, own.apart(sampler))
-        fits = violation(boxes_m, own.reading, own.apart(sampler)) == 0
+        boxes_m = resolve_overlap(boxes_m, own.state, own.apart(sampler))
+        fits = violation(boxes_m, own.state, own.apart(sampler)) == 0
         if checks is not None:
             free = fits.nonzero()[:, 0]
             allowed = checks.each(rows[waiting[free]], own.rows(free), boxes_m[free])
@@ -156,7 +159,7 @@ class _Checks:
     ) -> list[str]:
         """The reason why the object of each particle may not take its place; empty if it may."""
         candidates = furniture_of(self._sampler, boxes_m, found.label, found.look)
-        rectangle_m = found.reading.frame.rectangle_m.double().numpy()
+        rectangle_m = found.state.frame.rectangle_m.double().numpy()
         reasons = []
         for at, row in enumerate(rows.tolist()):
             one = slice(at, at + 1)
@@ -167,7 +170,7 @@ class _Checks:
 
 def _proposed(
     sampler: RoomSampler,
-    state: Reading,
+    state: EncoderState,
     label: Int[Tensor, " some"],
     logits: Float[Tensor, "#some looks"],
     uniform: Float[Tensor, "some 3"],
@@ -195,7 +198,7 @@ def _search(
     particles: Particles,
     checks: _Checks | None,
     row: int,
-    state: Reading,
+    state: EncoderState,
     step: int,
     draws: np.random.Generator,
 ) -> str:
@@ -212,16 +215,16 @@ def _search(
     found = _proposed(sampler, many, label, logits, uniform, plans, torch.full((CANDIDATES,), room))
     placed_m = particles.rooms.boxes_m[row, : particles.number[row]].numpy()
     place_m = _anywhere(
-        found.size_m[:, ::2].numpy(), found.reading.frame.rectangle_m.numpy(), placed_m, draws
+        found.size_m[:, ::2].numpy(), found.state.frame.rectangle_m.numpy(), placed_m, draws
     )
     boxes_m = found.boxes_m(place_m)
-    free = (violation(boxes_m, found.reading, found.apart(sampler)) == 0).nonzero()[:, 0]
+    free = (violation(boxes_m, found.state, found.apart(sampler)) == 0).nonzero()[:, 0]
     if not len(free):
         return "free floor"
     if checks is not None:
         some = found.rows(free)
         candidates = furniture_of(sampler, boxes_m[free], some.label, some.look)
-        rectangle_m = some.reading.frame.rectangle_m.double().numpy()
+        rectangle_m = some.state.frame.rectangle_m.double().numpy()
         allowed, reason = checks.allowed(row, candidates, rectangle_m, COMPARED)
         free = free[torch.from_numpy(allowed)]
         if not len(free):
@@ -254,3 +257,43 @@ def _anywhere(
         beside = near[:, [0, 2]] + side * np.where(outside, theirs + own, theirs - own)
         found = np.where((way >= FLUSH) & (way < FLUSH + ADJACENT), beside, found)
     return torch.from_numpy(found).float()
+
+
+def resolve_overlap(
+    boxes_m: Float[Tensor, "rooms 6"], state: EncoderState, apart: Bool[Tensor, "rooms objects"]
+) -> Float[Tensor, "rooms 6"]:
+    """Move boxes out of objects marked in `apart`, and into the rectangle, along each axis by at
+    most `GRAZE_M`, because sampled places are not accurate to the centimetre."""
+    others_m = state.before.boxes_m
+    shared = shared_extents(boxes_m.unsqueeze(1), others_m)
+    grazes = apart & state.before.is_object & (shared > 0).all(dim=-1)
+    x_and_z, away = shared[..., ::2], (boxes_m.unsqueeze(1) - others_m)[..., [0, 2]]
+    least = x_and_z == x_and_z.amin(dim=-1, keepdim=True)
+    moves = x_and_z * away.sign() * (least & (x_and_z <= GRAZE_M) & grazes.unsqueeze(-1))
+    centre = boxes_m[:, [0, 2]] + moves.sum(dim=1)
+    middle, extents = state.frame.rectangle_m.split(2, dim=-1)
+    free = ((extents - boxes_m[:, [3, 5]]) / 2).clamp(min=0)
+    inside = centre.clamp(middle - free, middle + free)
+    centre = inside.where((inside - centre).abs() <= GRAZE_M, centre)
+    moved = boxes_m.clone()
+    moved[:, [0, 2]] = centre
+    return moved
+
+
+def violation(
+    boxes_m: Float[Tensor, "rooms 6"], state: EncoderState, apart: Bool[Tensor, "rooms objects"]
+) -> Float[Tensor, " rooms"]:
+    """Violation of a box; 0 if there is none.
+
+    The violation is the sum of two terms: the shared volumes with objects marked in `apart`, each
+    relative to the smaller box, and the metres by which the box extends beyond the rectangle.
+    """
+    others = state.before
+    here, theirs = boxes_m.unsqueeze(1), others.boxes_m
+    shared = shared_extents(here, theirs).prod(dim=-1)
+    least = torch.minimum(here[..., 3:].prod(dim=-1), theirs[..., 3:].prod(dim=-1))
+    share = shared / least.clamp(min=1e-9)
+    share = share.where((share > INTERSECTING) & others.is_object & apart, 0.0)
+    middle, extents = state.frame.rectangle_m.split(2, dim=-1)
+    beyond = (boxes_m[:, [0, 2]] - middle).abs() + (boxes_m[:, [3, 5]] - extents) / 2
+    return share.sum(dim=-1) + (beyond.amax(dim=-1) - BEYOND_M).clamp(min=0)

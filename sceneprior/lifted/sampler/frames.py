@@ -8,16 +8,13 @@ four cases are learnt as one.
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from sceneprior.core.boxes import QUARTERS, turn_boxes
 from sceneprior.lifted.prototypes import POSES, turn_posed
 from sceneprior.lifted.rooms import PosedRooms
-from sceneprior.lifted.sampler.rooms import gaps_to_sides_m, own_sides, rectangles_of
-
-FURTHEST_M = 1.0
-"""Length to which gaps to the sides of the rectangle are clipped before they are averaged."""
+from sceneprior.lifted.sampler.rooms import own_sides
 
 
 def side_of(
@@ -58,29 +55,3 @@ def turn_places(
     """Places (x, z) after their rooms are turned by `quarters`."""
     nothing = torch.zeros_like(place_m)
     return turn_rectangles(torch.cat([place_m, nothing], dim=-1), quarters)[:, :2]
-
-
-def gaps_by_side(rooms: PosedRooms) -> Float[Tensor, "rooms objects 4"]:
-    """Gaps in metres from each object to the four sides of its room's rectangle: low z, low x, high
-    z, high x."""
-    low, high = gaps_to_sides_m(rooms.boxes_m, rectangles_of(rooms))
-    return torch.stack([low[..., 1], low[..., 0], high[..., 1], high[..., 0]], dim=-1)
-
-
-def mean_by_prototype(
-    values: Float[Tensor, "rooms objects 4"], rooms: PosedRooms, prototypes: int
-) -> tuple[Float[Tensor, "prototypes 4"], Bool[Tensor, " prototypes"]]:
-    """Mean of the objects' values over the objects of each prototype, and whether it occurs."""
-    assert rooms.looks is not None
-    which = rooms.looks[rooms.is_object] // POSES
-    total = torch.zeros(prototypes, QUARTERS).index_add_(0, which, values[rooms.is_object])
-    number = torch.bincount(which, minlength=prototypes)
-    return total / number.clamp(min=1).unsqueeze(-1), number > 0
-
-
-def find_backs(rooms: PosedRooms, prototypes: int) -> Int[Tensor, " prototypes"]:
-    """The side of each prototype, in pose 0, with the smallest mean gap to the sides of its rooms'
-    rectangles; 0 for unused prototypes."""
-    assert rooms.looks is not None
-    gaps_m = gaps_by_side(rooms).clamp(max=FURTHEST_M).gather(-1, own_sides(rooms.looks))
-    return mean_by_prototype(gaps_m, rooms, prototypes)[0].argmin(dim=1)

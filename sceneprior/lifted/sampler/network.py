@@ -5,6 +5,7 @@ import math
 
 import torch
 from jaxtyping import Float, Int
+from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from sceneprior.core.boxes import QUARTERS
@@ -12,14 +13,14 @@ from sceneprior.core.mixtures import LogisticMixture, draw_index
 from sceneprior.lifted.prototypes import POSES, turn_posed
 from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.contents import Contents
-from sceneprior.lifted.sampler.look_scores import LookScores
+from sceneprior.lifted.sampler.encoder_state import LENGTHS, EncoderState, Frame, fourier_features
+from sceneprior.lifted.sampler.pairwise_potentials import PairwisePotentials
 from sceneprior.lifted.sampler.placement import SHOWN, Placement
 from sceneprior.lifted.sampler.places import Places
-from sceneprior.lifted.sampler.reading import LENGTHS, Frame, Reading, lengths_shown
+from sceneprior.lifted.sampler.prototype_statistics import SIZES
 from sceneprior.lifted.sampler.rooms import SYMMETRIES, gaps_m, rectangle_sides
-from sceneprior.lifted.sampler.settings import SamplerConfig
-from sceneprior.lifted.sampler.sizes import SIZES
 from sceneprior.paper.layers import mlp
+from sceneprior.training.method import TrainConfig
 
 CLASS_WIDTH = 32
 """Dimension of the class embedding."""
@@ -38,6 +39,29 @@ def _own_pose() -> Int[Tensor, "symmetries poses"]:
 
 OWN_POSE = _own_pose()
 """Maps (room symmetry, observed pose) to the pose in the untransformed room."""
+
+
+class SamplerConfig(TrainConfig):
+    """Training and size of the sampler: the section `sampler` of a run's YAML."""
+
+    batch_size: int = Field(64, ge=1)
+    learning_rate: float = Field(1e-3, gt=0)
+    weight_decay: float = Field(0.01, ge=0)
+    clip_gradient: float = Field(1.0, ge=0)
+    width: int = Field(128, ge=8)
+    """Width of the transformer encoder; its feed-forward layers are twice as wide."""
+    layers: int = Field(2, ge=1, le=100)
+    heads: int = Field(4, ge=1)
+    dropout: float = Field(0.1, ge=0, lt=1)
+    val_every: int = Field(10, ge=1)
+    """Epochs between evaluations on the val rooms. The network that gives them the highest
+    likelihood is kept, or the newest network if there are no val rooms."""
+
+    @model_validator(mode="after")
+    def _heads_divide_width(self) -> "SamplerConfig":
+        if self.width % self.heads:
+            raise ValueError(f"width {self.width} is not a multiple of heads {self.heads}")
+        return self
 
 
 class RoomSampler(nn.Module):
@@ -114,7 +138,7 @@ class RoomSampler(nn.Module):
         self.wanted_look = _head(known, width, MATCH_WIDTH)
         self.offered_look = _head(SHOWN, width, MATCH_WIDTH)
         self.frequency = nn.Parameter(torch.zeros(prototypes, POSES))
-        self.look_scores = LookScores(classes)
+        self.look_scores = PairwisePotentials(classes)
         self.extents_head = _head(known + width, width, EXTENTS * 7)
         self.placement = Placement(classes, min(2 * dropout, 0.5))
 
@@ -149,7 +173,7 @@ class RoomSampler(nn.Module):
         place, footprint = centre[..., ::2] - middle, size[..., ::2]
         bottom = centre[..., 1:2] - size[..., 1:2] / 2
         low, high = (extents - footprint) / 2 + place, (extents - footprint) / 2 - place
-        shown = lengths_shown(torch.cat([place, bottom, size, low, high], dim=-1))
+        shown = fourier_features(torch.cat([place, bottom, size, low, high], dim=-1))
         known = torch.cat([self.class_embedding(rooms.object_class), shown], dim=-1)
         return self.object_embedding(known) + self.look_embedding(self.look_shown[rooms.looks])
 
@@ -159,18 +183,18 @@ class RoomSampler(nn.Module):
         coming: Float[Tensor, "rooms classes"],
         frame: Frame,
         tokens: Float[Tensor, "rooms objects width"],
-    ) -> Reading:
+    ) -> EncoderState:
         """Encode the objects placed so far, in any order, from their `tokens`, and the counts of
         each class still to come."""
         query = self.query + self.summary_embedding(self.summary(before, coming, frame))
-        shown = self.rectangle_embedding(lengths_shown(frame.rectangle_m))
+        shown = self.rectangle_embedding(fourier_features(frame.rectangle_m))
         features = torch.cat([query.unsqueeze(1), shown.unsqueeze(1), tokens], dim=1)
         features = self.dropout(features)
         nothing = torch.cat([before.is_object.new_zeros(len(tokens), 2), ~before.is_object], dim=1)
         for layer in self.encoder:
             features = layer(features, src_key_padding_mask=nothing)
         features = self.norm(features)
-        return Reading(before, frame, coming, features[:, 0])
+        return EncoderState(before, frame, coming, features[:, 0])
 
     def summary(
         self, before: PosedRooms, coming: Float[Tensor, "rooms classes"], frame: Frame
@@ -183,30 +207,30 @@ class RoomSampler(nn.Module):
         low, high = rectangle_sides(frame.rectangle_m)
         whole = torch.cat([high - low] * 2, dim=-1)
         gaps = gaps_m(before, frame.rectangle_m).where(furnished, whole)
-        return torch.cat([counts, coming, lengths_shown(gaps)], dim=-1)
+        return torch.cat([counts, coming, fourier_features(gaps)], dim=-1)
 
     def look_logits(
-        self, reading: Reading, label: Int[Tensor, " rooms"]
+        self, state: EncoderState, label: Int[Tensor, " rooms"]
     ) -> Float[Tensor, "rooms looks"]:
         """Logits of the next object's look, given its class; looks of other classes are ruled
         out."""
-        known = torch.cat([reading.context, self.class_embedding(label)], dim=-1)
+        known = torch.cat([state.context, self.class_embedding(label)], dim=-1)
         shown = self.look_shown[: self.looks]
         offered = self.offered_look(shown)
         logits = self.wanted_look(known) @ offered.T / math.sqrt(MATCH_WIDTH)
         own_pose = OWN_POSE.to(self.frequency.device)
         frequency = self.frequency[:, own_pose].transpose(0, 1).flatten(1)[:, : self.looks]
-        logits = logits + frequency[reading.frame.symmetry]
-        counts = self.counts(reading.before) + reading.coming
-        logits = logits + self.look_scores(label, reading.before, counts, shown, self.backs)
+        logits = logits + frequency[state.frame.symmetry]
+        counts = self.counts(state.before) + state.coming
+        logits = logits + self.look_scores(label, state.before, counts, shown, self.backs)
         others = self.look_class[: self.looks] != label.unsqueeze(-1)
         return logits.masked_fill(others, -torch.inf)
 
     def extents(
-        self, reading: Reading, label: Int[Tensor, " rooms"], look: Int[Tensor, " rooms"]
+        self, state: EncoderState, label: Int[Tensor, " rooms"], look: Int[Tensor, " rooms"]
     ) -> LogisticMixture:
         """Distribution of the object's log extents, relative to those of its look."""
-        return LogisticMixture.of(self.extents_head(self._known(reading, label, look)), 3)
+        return LogisticMixture.of(self.extents_head(self._known(state, label, look)), 3)
 
     def draw_size(
         self, look: Int[Tensor, " rooms"], uniform: Float[Tensor, " rooms"]
@@ -230,16 +254,16 @@ class RoomSampler(nn.Module):
 
     def place(
         self,
-        reading: Reading,
+        state: EncoderState,
         label: Int[Tensor, " rooms"],
         look: Int[Tensor, " rooms"],
         size_m: Float[Tensor, "rooms 3"],
         bottom_m: Float[Tensor, " rooms"],
     ) -> Places:
         """Distribution of the x and z of the object's centre."""
-        counts = torch.cat([self.counts(reading.before), reading.coming], dim=-1)
+        counts = torch.cat([self.counts(state.before), state.coming], dim=-1)
         return self.placement(
-            label, look, size_m, bottom_m, reading.frame.rectangle_m, reading.before, counts,
+            label, look, size_m, bottom_m, state.frame.rectangle_m, state.before, counts,
             self.look_shown, self.backs,
         )  # fmt: skip
 
@@ -247,27 +271,29 @@ class RoomSampler(nn.Module):
         """Number of objects of each class."""
         return self.contents.before(rooms.object_class, rooms.is_object)[:, -1]
 
-    def log_prob(self, reading: Reading, coming: PosedRooms) -> dict[str, Float[Tensor, " rooms"]]:
+    def log_prob(
+        self, state: EncoderState, coming: PosedRooms
+    ) -> dict[str, Float[Tensor, " rooms"]]:
         """Log-probabilities of the look, size and place of each room's next object, given its
         class. Every room of `coming` has one object."""
         assert coming.looks is not None
         label, look = coming.object_class[:, 0], coming.looks[:, 0]
         centre_m, size_m = coming.boxes_m[:, 0].split(3, dim=-1)
         bottom_m = centre_m[:, 1] - size_m[:, 1] / 2
-        looks = self.look_logits(reading, label).log_softmax(dim=-1)
+        looks = self.look_logits(state, label).log_softmax(dim=-1)
         extents = size_m.log() - self.look_shown[look, -3:]
-        place = self.place(reading, label, look, size_m, bottom_m)
+        place = self.place(state, label, look, size_m, bottom_m)
         return {
             "look": looks.gather(-1, look.unsqueeze(-1))[:, 0],
-            "size": self.extents(reading, label, look).log_prob(extents),
+            "size": self.extents(state, label, look).log_prob(extents),
             "place": place.log_prob(centre_m[:, ::2]),
         }
 
     def _known(
-        self, reading: Reading, label: Int[Tensor, " rooms"], look: Int[Tensor, " rooms"]
+        self, state: EncoderState, label: Int[Tensor, " rooms"], look: Int[Tensor, " rooms"]
     ) -> Float[Tensor, "rooms known"]:
         look_seen = self.look_embedding(self.look_shown[look])
-        return torch.cat([reading.context, self.class_embedding(label), look_seen], dim=-1)
+        return torch.cat([state.context, self.class_embedding(label), look_seen], dim=-1)
 
 
 def _swapped(

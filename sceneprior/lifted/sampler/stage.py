@@ -2,11 +2,13 @@
 
 import copy
 import math
+from dataclasses import replace
 from typing import Any
 
 import lightning
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from sklearn.mixture import GaussianMixture
 from torch import Tensor, nn
@@ -14,13 +16,17 @@ from torch import Tensor, nn
 from sceneprior.lifted.prototypes import POSES
 from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.contents import END
-from sceneprior.lifted.sampler.frames import find_backs
-from sceneprior.lifted.sampler.fronts import find_fronts
-from sceneprior.lifted.sampler.likelihood import negative_log_likelihood
-from sceneprior.lifted.sampler.network import RECTANGLES, RoomSampler
-from sceneprior.lifted.sampler.rooms import SYMMETRIES, SamplerRooms, frames_of, turned_rooms
-from sceneprior.lifted.sampler.settings import SamplerConfig
-from sceneprior.lifted.sampler.sizes import find_sizes
+from sceneprior.lifted.sampler.encoder_state import Frame
+from sceneprior.lifted.sampler.network import RECTANGLES, RoomSampler, SamplerConfig
+from sceneprior.lifted.sampler.prototype_statistics import find_backs, find_fronts, find_sizes
+from sceneprior.lifted.sampler.rooms import (
+    SYMMETRIES,
+    SamplerRooms,
+    frames_of,
+    large_first,
+    shuffled,
+    turned_rooms,
+)
 from sceneprior.paper.losses import share_of_batch
 from sceneprior.paper.prior import ScenePrior
 from sceneprior.training.steps import (
@@ -34,8 +40,8 @@ from sceneprior.training.steps import (
 ORDERS = 4
 """Number of random object orders over which the likelihood of every val room is averaged."""
 TABLES_RATE = 10.0
-"""Learning rate of the tables of `Placement` and `LookScores` relative to that of the rest. It is
-high because a pair of classes occurs in only a few batches of an epoch."""
+"""Learning rate of the tables of `Placement` and `PairwisePotentials` relative to that of the rest.
+It is high because a pair of classes occurs in only a few batches of an epoch."""
 TABLES_DECAY = 10.0
 """Weight decay of these tables relative to that of the rest."""
 CONTENTS_RATE = 5.0
@@ -47,6 +53,9 @@ FRAMES = 8
 LEAST_VARIANCE = 0.01
 """Added to the variances of the mixture of rectangles: 10 cm squared, or a tenth of an extent
 squared."""
+
+PARTS_OF_OBJECT = ("look", "size", "place")
+"""Parts of an object's likelihood given its class."""
 
 
 class SamplerStage(lightning.LightningModule):
@@ -180,3 +189,51 @@ def teach(sampler: RoomSampler, rooms: SamplerRooms) -> None:
         (sampler.rectangle_factors, np.linalg.cholesky(mixture.covariances_)),
     ):
         buffer.copy_(torch.from_numpy(values))
+
+
+def negative_log_likelihood(
+    sampler: RoomSampler,
+    rooms: PosedRooms,
+    symmetry: Int[Tensor, " rooms"],
+    generator: torch.Generator,
+) -> dict[str, Float[Tensor, " rooms"]]:
+    """Negative log-likelihood of each room given its rectangle, in parts.
+
+    The parts are the room's list of classes (`class`), and the look, size and place of its objects,
+    each given the previous objects and the classes still to come, in a random order. The mean over
+    orders is an upper bound of the negative log-likelihood of the set of objects.
+
+    Args:
+        symmetry: Symmetry in which each room is presented.
+    """
+    listed = shuffled(rooms, generator)
+    uniform = torch.rand(rooms.is_object.shape, generator=generator).to(rooms.boxes_m)
+    rooms = rooms.take(large_first(rooms.object_class, sampler.footprints_m2, uniform))
+    frame = Frame(frames_of(rooms, generator), symmetry)
+    rooms = replace(rooms, walls_m=None)
+    tokens = sampler.tokens(rooms, frame.rectangle_m)
+    counts = rooms.is_object.sum(dim=1)
+    there = sampler.contents.before(rooms.object_class, rooms.is_object)
+    still = there[:, -1:] - there
+    zeros = tokens.new_zeros(len(counts))
+    found = dict.fromkeys(PARTS_OF_OBJECT, zeros)
+    # One call per step, on the rooms with that many objects, so that nothing is padded. Rooms
+    # without objects are read in the first call, since the encoder rejects an empty batch.
+    for step in range(max(int(counts.max()), 1)):
+        row = (counts.clamp(min=1) > step).nonzero()[:, 0]
+        before = _first(rooms, row, step)
+        state = sampler.read(before, still[row, step], frame.rows(row), tokens[row, :step])
+        going = (counts[row] > step).nonzero()[:, 0]
+        row = row[going]
+        following = _first(rooms, row, step + 1).take(torch.full((len(row), 1), step).to(row))
+        for name, log_prob in sampler.log_prob(state.rows(going), following).items():
+            found[name] = found[name].index_add(0, row, -log_prob)
+    listing = sampler.contents.negative_log_likelihood(
+        listed.object_class, listed.is_object, frame.rectangle_m[:, 2:]
+    )
+    return {"class": listing, **found}
+
+
+def _first(rooms: PosedRooms, row: Int[Tensor, " some"], step: int) -> PosedRooms:
+    """The rooms with indices `row`, cut to their first `step` objects."""
+    return rooms.changed(lambda part: part[row, :step])

@@ -7,7 +7,7 @@ from sceneprior.core.parts import whole_box
 from sceneprior.lifted.prototypes import Prototypes, turn_posed
 from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.frames import own_sides, side_of
-from sceneprior.lifted.sampler.fronts import _gaps_to_furniture, find_fronts
+from sceneprior.lifted.sampler.prototype_statistics import _gaps_to_furniture, find_fronts
 from sceneprior.lifted.sampler.rooms import SYMMETRIES, turned_rooms
 
 CELLS = 8

@@ -12,8 +12,7 @@ from sceneprior.core.boxes import QUARTERS
 from sceneprior.lifted.prototypes import turn_posed
 from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.contents import END
-from sceneprior.lifted.sampler.likelihood import negative_log_likelihood
-from sceneprior.lifted.sampler.reading import Frame
+from sceneprior.lifted.sampler.encoder_state import Frame
 from sceneprior.lifted.sampler.rooms import (
     SYMMETRIES,
     SamplerRooms,
@@ -22,6 +21,7 @@ from sceneprior.lifted.sampler.rooms import (
     rectangles_of,
     shuffled,
 )
+from sceneprior.lifted.sampler.stage import negative_log_likelihood
 
 
 @pytest.fixture(scope="module")
@@ -125,41 +125,6 @@ def test_how_often_a_look_comes_turns_with_the_room(sampler, rooms):
             sampler.frequency[0, 2] -= 3.0
 
 
-@torch.no_grad()
-def test_scores_by_the_other_furniture_are_added_to_looks(rooms):
-    sampler = small_sampler(rooms).double()
-    whole = in_float64(rooms.rooms)
-    coming = torch.eye(len(sampler.may_meet)).double()[2].expand(len(rooms), -1)
-    reading = read(sampler, whole, rectangles_of(whole), coming)
-    label = torch.full((len(rooms),), 2)
-    plain = sampler.look_logits(reading, label)
-    for table in sampler.look_scores.parameters():
-        table.normal_(generator=torch.Generator().manual_seed(0))
-    counts, shown = sampler.counts(whole) + coming, sampler.look_shown[: sampler.looks]
-    added = sampler.look_scores(label, whole, counts, shown, sampler.backs)
-    assert added.std() > 0.1
-    possible = plain.isfinite()
-    gain = sampler.look_logits(reading, label) - plain
-    assert_close(gain[possible], added[possible])
-
-
-def test_the_network_knows_what_is_to_come(sampler, rooms):
-    whole = in_float64(rooms.rooms)
-    coming = torch.eye(len(sampler.may_meet)).double()[1].expand(len(rooms), -1)
-    frame = rectangles_of(whole)
-    alone, more = read(sampler, whole, frame).context, read(sampler, whole, frame, coming).context
-    assert not torch.isclose(alone, more).all(dim=-1).any()
-
-
-def test_looks_of_other_classes_are_ruled_out(sampler, rooms):
-    whole = in_float64(rooms.rooms)
-    reading = read(sampler, whole, rectangles_of(whole))
-    logits = sampler.look_logits(reading, torch.full((len(rooms),), 2))
-    classes = sampler.look_class[: logits.shape[1]]
-    assert torch.equal(logits.isfinite(), (classes == 2).expand_as(logits))
-    assert (sampler.look_class[logits.shape[1] :] == -1).all()
-
-
 def test_gradients_of_the_likelihood_are_right(rooms):
     sampler = small_sampler(rooms, width=8).double().requires_grad_(True)
     two = in_float64(rooms.rooms).changed(lambda part: part[:2])
@@ -184,8 +149,3 @@ class _Likelihood(torch.nn.Module):
     def forward(self, rooms: PosedRooms) -> dict[str, torch.Tensor]:
         generator = torch.Generator().manual_seed(0)
         return negative_log_likelihood(self.sampler, rooms, as_they_are(rooms), generator)
-
-
-def test_void_ends_a_room(sampler):
-    assert END == 0
-    assert not (sampler.look_class == END).any()

@@ -5,12 +5,10 @@ import torch
 from torch.testing import assert_close
 
 from sceneprior.core.boxes import QUARTERS, turn_boxes
-from sceneprior.core.mixtures import LogisticMixture
 from sceneprior.lifted.prototypes import POSES, turn_posed
 from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler import places as module
 from sceneprior.lifted.sampler.frames import (
-    find_backs,
     into_frames,
     side_of,
     turn_places,
@@ -18,6 +16,7 @@ from sceneprior.lifted.sampler.frames import (
 )
 from sceneprior.lifted.sampler.placement import Placement
 from sceneprior.lifted.sampler.places import Places, ramps
+from sceneprior.lifted.sampler.prototype_statistics import find_backs
 
 CLASSES, LOOKS = 4, 3 * POSES
 
@@ -164,49 +163,6 @@ def test_draws_follow_the_density(placement, given, monkeypatch):
     )
 
 
-def test_without_objects_and_larger_than_the_rectangle(placement):
-    """Anchors flush with either side of a rectangle that is too small are its middle."""
-    nothing = torch.zeros(1, 0, dtype=torch.int64)
-    rooms = PosedRooms(nothing, nothing > 0, torch.zeros(1, 0, 6).double(), looks=nothing)
-    rectangle_m = torch.tensor([[1.0, 2.0, 0.5, 0.5]]).double()
-    found = distribution(
-        placement, rooms, torch.tensor([0]), torch.full((1, 3), 3.0).double(), rectangle_m
-    )
-    at_m, exists, kind = found._anchors(1)
-    assert at_m.tolist() == [[2.0] * 6 + [0.0] * 2]
-    assert exists.all() and kind.tolist() == list(range(8))
-    assert found.log_prob(torch.zeros(1, 2).double()).isfinite().all()
-
-
-def test_an_object_learns_to_stand_beside_another():
-    """A few steps on rooms in which it stands to the right of the bed, wherever that is."""
-    torch.manual_seed(0)
-    placement = Placement(CLASSES, 0.0).double()
-    rng = torch.Generator().manual_seed(4)
-    many = 64
-    boxes_m = torch.tensor([0.0, 0.5, 0.0, 1.5, 1.0, 2.0]).double().repeat(many, 1, 1)
-    boxes_m[:, 0, [0, 2]] = torch.rand(many, 2, generator=rng).double() - 0.5
-    here = torch.ones(many, 1, dtype=torch.bool)
-    looks = torch.zeros(many, 1, dtype=torch.int64)
-    rooms = PosedRooms(here.long(), here, boxes_m, looks=looks)
-    size_m = torch.tensor([0.5, 0.5, 0.5]).double().repeat(many, 1)
-    frame = torch.tensor([0.0, 0.0, 6.0, 6.0]).double().expand(many, -1)
-    beside_m = boxes_m[:, 0, [0, 2]] + torch.tensor([1.0, -0.75]).double()
-    optimizer = torch.optim.Adam(placement.parameters(), lr=0.02)
-    for _ in range(100):
-        loss = -distribution(placement, rooms, looks[:, 0], size_m, frame).log_prob(beside_m).mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-    boxes_m[:, 0, [0, 2]] = 2 * torch.rand(many, 2, generator=rng).double() - 1
-    places = distribution(placement, rooms, looks[:, 0], size_m, frame)
-    uniform = torch.rand(many, 4, generator=rng).double()
-    with torch.no_grad():
-        drawn = places.draw(places.draw_x(uniform[:, None, :2])[:, 0], uniform[:, 2:])
-    off = drawn - boxes_m[:, 0, [0, 2]] - torch.tensor([1.0, -0.75]).double()
-    assert (off.norm(dim=-1) < 0.2).double().mean() > 0.8
-
-
 def test_the_back_is_the_side_at_the_wall():
     """The same prototype before four walls, in the poses that face the room; the bed that is
     mirrored has its back at the other side along x."""
@@ -233,13 +189,3 @@ def test_ramps_are_piecewise_linear():
     lengths = torch.tensor([-1.0, 0.25, 1.5, 9.0])
     expected = [[0, 0], [0.25, 0], [1, 0.25], [1, 1]]
     assert torch.stack([ramps(one[None], (0.0, 1.0, 3.0)) for one in lengths]).tolist() == expected
-
-
-def test_draws_are_sharper_than_the_density():
-    """Weights 1 and 3 become 1 and 3 ** 1.5; scales shrink."""
-    weights = torch.tensor([1.0, 3.0])
-    plain = LogisticMixture(weights.log(), torch.zeros(2, 1), torch.zeros(2, 1))
-    sharp = module._sharpened(plain)
-    odds = sharp.weight_logits.softmax(dim=0)
-    assert float(odds[1] / odds[0]) == pytest.approx(3**module.SHARPNESS)
-    assert sharp.log_scales.exp().tolist() == [[pytest.approx(module.SPREAD)]] * 2

@@ -15,15 +15,11 @@ from sceneprior.lifted.lifting.dataset import LiftedDataset
 from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.rooms import (
     FRAME_M,
-    LOOSELY,
     SYMMETRIES,
     SamplerRooms,
     frames_of,
-    gaps_m,
-    large_first,
     rectangle_sides,
     rectangles_of,
-    shared_extents,
     shuffled,
     turned_rooms,
 )
@@ -52,13 +48,6 @@ def test_other_rooms_take_the_looks_of_the_training_rooms(rooms):
     other = sampler_rooms(seed=5)
     assert np.array_equal(other.prototypes.grids, rooms.prototypes.grids)
     assert other.rooms.looks.max() < 8 * len(rooms.prototypes.grids)
-
-
-def test_a_blank_draw_is_an_empty_room(rooms):
-    batch = rooms.__getitems__([(1, 0), (2, -1)])
-    assert batch.is_object.any(dim=1).tolist() == [True, False]
-    assert batch.room_ids == ("room1", "room2")
-    assert batch.looks is not None
 
 
 def test_rectangles_hold_all_footprints_and_no_more():
@@ -129,18 +118,6 @@ def test_walls_turn_with_their_room(rooms, symmetry):
     assert turned.walls_m.isnan().sum() == len(rooms)
 
 
-def test_gaps_to_the_sides_of_a_rectangle():
-    box = torch.tensor([[[0.5, 0.5, 0.0, 1.0, 1.0, 1.0]]])
-    one = PosedRooms(torch.ones(1, 1, dtype=torch.int64), torch.ones(1, 1, dtype=torch.bool), box)
-    assert gaps_m(one, torch.tensor([[0.0, 0.0, 4.0, 2.0]])).tolist() == [[2.0, 0.5, 1.0, 0.5]]
-
-
-def test_boxes_share_what_they_do_along_each_axis():
-    a = torch.tensor([0.0, 0, 0, 2, 2, 2])
-    b = torch.tensor([1.0, 0, 5, 2, 1, 1])
-    assert shared_extents(a, b).tolist() == [1.0, 1.0, 0.0]
-
-
 def test_symmetries_move_boxes_looks_and_rectangles_together(rooms):
     batch = rooms.rooms
     seen = set()
@@ -183,31 +160,9 @@ def test_classes_may_meet_that_do_often_enough():
     assert not with_looks(lifted).may_meet(CLASSES).any()
 
 
-def test_boxes_that_graze_do_not_meet():
-    lifted = lifted_rooms(2)
-    boxes = lifted.boxes[0]
-    boxes.centers_m[1] = boxes.centers_m[0] + np.array(
-        [(boxes.sizes_m[0, 0] + boxes.sizes_m[1, 0]) / 2 - 0.04, 0, 0]
-    )
-    assert not with_looks(lifted).may_meet(CLASSES).any()
-
-
 def test_rooms_are_drawn_of_common_prototypes_alone(rooms):
     prototypes = rooms.prototypes._replace(common=np.arange(len(rooms.prototypes.grids)) < 1)
     prototypes = prototypes._replace(object_class=np.abs(prototypes.object_class))
     seen = sampler_rooms().assign_prototypes(prototypes)
     assert seen.prototypes.object_class.tolist()[1:] == [-1] * (len(prototypes.grids) - 1)
     assert seen.rooms.is_object.any() and (seen.rooms.looks[seen.rooms.is_object] < 8).all()
-
-
-def test_what_is_large_tends_to_come_first_and_padding_comes_last():
-    footprints_m2 = torch.tensor([1.0, 4.0, 1.0, 0.5 / math.exp(LOOSELY)])
-    labels = torch.tensor([[3, 2, 1, 0, 2]]).expand(4000, -1)
-    uniform = torch.rand(labels.shape, generator=torch.Generator().manual_seed(0))
-    ordered = labels.gather(1, large_first(labels, footprints_m2, uniform))
-    assert (ordered[:, 4] == 0).all() and (ordered[:, 3] == 3).all()
-    first = (ordered[:, 0] == 1).float().mean()
-    assert 0.5 < first < 1, "four times as large: mostly"
-    same = torch.tensor([[1, 1]]).expand(4000, -1)
-    swapped = large_first(same, footprints_m2, uniform[:, :2])[:, 0].float().mean()
-    assert abs(swapped - 0.5) < 0.05

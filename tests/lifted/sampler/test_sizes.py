@@ -6,13 +6,12 @@ from itertools import combinations
 import numpy as np
 import pytest
 import torch
-from rooms_of_boxes import PROTOTYPES, sampler_rooms, small_sampler
+from rooms_of_boxes import PROTOTYPES, sampler_rooms
 from torch.testing import assert_close
 
 from sceneprior.lifted.prototypes import POSES
-from sceneprior.lifted.sampler import sizes as module
+from sceneprior.lifted.sampler.prototype_statistics import COMMON, SAME_SIZE, SIZES, find_sizes
 from sceneprior.lifted.sampler.rooms import SamplerRooms, turned_rooms
-from sceneprior.lifted.sampler.sizes import COMMON, SAME_SIZE, SIZES, find_sizes
 
 
 @pytest.fixture(scope="module")
@@ -73,14 +72,6 @@ def test_entries_are_those_of_a_plain_loop(rooms):
         assert_close(np.array(sorted(found)), np.array(sorted(wanted)), atol=2e-5, rtol=0)
 
 
-def test_the_most_frequent_are_kept(rooms, monkeypatch):
-    *_, every = find_sizes(rooms.rooms, rooms.prototypes, PROTOTYPES)
-    monkeypatch.setattr(module, "SIZES", 2)
-    *_, few = find_sizes(rooms.rooms, rooms.prototypes, PROTOTYPES)
-    assert torch.equal(few, every[:, :2])
-    assert (every.diff(dim=1) <= 0).all()
-
-
 def test_a_room_turned_or_mirrored_teaches_the_same_sizes(rooms):
     plain = find_sizes(rooms.rooms, rooms.prototypes, PROTOTYPES)
     turned = turned_rooms(rooms.rooms, torch.arange(len(rooms)) % 8)
@@ -101,25 +92,3 @@ def test_a_prototype_with_one_object_or_none_has_one_size():
     assert not floor_m.any() and torch.equal(ones, wanted) and torch.equal(numbers, wanted)
     first = int(alone.looks[1, 0])
     assert_close(found_m[first // POSES, 0].sort().values, alone.boxes_m[1, 0, 3:].sort().values)
-
-
-def test_sizes_are_drawn_as_often_as_they_occur_in_the_pose_of_the_look():
-    sampler = small_sampler(sampler_rooms())
-    sampler.sizes_m[0, :2] = torch.tensor([[2.0, 0.8, 1.4], [1.0, 0.5, 0.6]])
-    sampler.size_counts[0] = torch.eye(SIZES)[0] * 3 + torch.eye(SIZES)[1]
-    uniform = (torch.arange(400) + 0.5) / 400
-    for pose in range(POSES):
-        drawn = sampler.draw_size(torch.full((400,), pose), uniform)
-        wanted = sampler.sizes_m[0, [0] * 300 + [1] * 100]
-        assert torch.equal(drawn, wanted.flip(-1) if pose % 2 else wanted)
-
-
-def test_the_height_is_that_of_the_most_similar_size():
-    sampler = small_sampler(sampler_rooms())
-    sampler.sizes_m[0, :2] = torch.tensor([[2.0, 0.8, 1.4], [1.0, 0.5, 0.6]])
-    sampler.bottoms_m[0, :2] = torch.tensor([0.0, 2.2])
-    sampler.size_counts[0] = torch.eye(SIZES)[:2].sum(dim=0)
-    asked_m = torch.tensor([[1.9, 0.8, 1.3], [0.9, 0.6, 0.6], [0.6, 0.6, 1.1], [1.0, 1.0, 1.0]])
-    # The last size is like the unused rows, which are no entries.
-    found_m = sampler.bottom_m(torch.tensor([0, 2, 1, 0]), asked_m)
-    assert torch.equal(found_m, torch.tensor([0.0, 2.2, 2.2, 2.2]))

@@ -22,7 +22,7 @@ MEASURES = 2
 the logarithm of the ratio of its extents."""
 
 
-class LookScores(nn.Module):
+class PairwisePotentials(nn.Module):
     """Scores of looks, added to the network's logits: functions with a few coefficients for each
     class or pair of classes, which a few hundred rooms suffice to learn.
 

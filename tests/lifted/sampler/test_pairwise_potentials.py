@@ -11,7 +11,7 @@ from sceneprior.lifted.prototypes import POSES, turn_posed
 from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.contents import MANY
 from sceneprior.lifted.sampler.frames import side_of
-from sceneprior.lifted.sampler.look_scores import MOST_LOG, LookScores
+from sceneprior.lifted.sampler.pairwise_potentials import MOST_LOG, PairwisePotentials
 from sceneprior.lifted.sampler.rooms import SYMMETRIES, turned_rooms
 
 CLASSES, PROTOTYPES = 4, 3
@@ -20,10 +20,10 @@ BACKS = torch.tensor([0, 1, 3])
 
 
 @pytest.fixture
-def scores() -> LookScores:
+def scores() -> PairwisePotentials:
     """With random tables."""
     torch.manual_seed(0)
-    scores = LookScores(CLASSES).double()
+    scores = PairwisePotentials(CLASSES).double()
     with torch.no_grad():
         for table in scores.parameters():
             table.normal_()
@@ -56,7 +56,7 @@ def look_shown() -> torch.Tensor:
     return torch.nn.functional.pad(torch.stack(poses, dim=1).flatten(0, 1), (4, 0))
 
 
-def scored(scores: LookScores, rooms: PosedRooms) -> torch.Tensor:
+def scored(scores: PairwisePotentials, rooms: PosedRooms) -> torch.Tensor:
     return scores(LABEL, rooms, COUNTS, look_shown(), BACKS)
 
 
@@ -97,19 +97,3 @@ def test_scores_turn_with_the_room(scores, rooms, symmetry):
     looks = torch.arange(LOOKS).expand(4, -1)
     at = turn_posed(looks, by % QUARTERS, by >= QUARTERS)
     assert_close(found.gather(1, at), plain, rtol=0, atol=1e-12)
-
-
-@torch.no_grad()
-def test_order_and_padding_change_nothing(scores, rooms):
-    plain = scored(scores, rooms)
-    order = torch.tensor([[3, 1, 0, 2], [2, 3, 1, 0], [1, 0, 3, 2], [1, 0, 2, 3]])
-    assert_close(scored(scores, rooms.take(order)), plain)
-    boxes_m = rooms.boxes_m.where(rooms.is_object.unsqueeze(-1), 0.0)
-    padded = PosedRooms(rooms.object_class, rooms.is_object, boxes_m, looks=rooms.looks)
-    assert_close(scored(scores, padded), plain)
-
-
-@torch.no_grad()
-def test_in_empty_rooms_only_sizes_count(scores, rooms):
-    nothing = rooms.changed(lambda part: part[:, :0])
-    assert torch.equal(scored(scores, nothing), scores.sizes(LABEL, COUNTS, look_shown()))

@@ -37,7 +37,7 @@ class Frame(NamedTuple):
         return Frame(self.rectangle_m[chosen], self.symmetry[chosen])
 
 
-class Reading(NamedTuple):
+class EncoderState(NamedTuple):
     """Encoder outputs for partly furnished rooms."""
 
     before: PosedRooms
@@ -47,13 +47,13 @@ class Reading(NamedTuple):
     context: Float[Tensor, "rooms width"]
     """Output of the query: the context for the next object."""
 
-    def rows(self, rows: Int[Tensor, " some"]) -> "Reading":
+    def rows(self, rows: Int[Tensor, " some"]) -> "EncoderState":
         """These outputs, reduced to the rooms with these indices."""
         before = self.before.changed(lambda part: part[rows])
-        return Reading(before, self.frame.rows(rows), self.coming[rows], self.context[rows])
+        return EncoderState(before, self.frame.rows(rows), self.coming[rows], self.context[rows])
 
 
-def lengths_shown(lengths_m: Float[Tensor, "*batch numbers"]) -> Float[Tensor, "*batch shown"]:
+def fourier_features(lengths_m: Float[Tensor, "*batch numbers"]) -> Float[Tensor, "*batch shown"]:
     """Encode lengths: the lengths themselves (in units of 4 m), then their Fourier features, a sine
     and a cosine for each of `OCTAVES` periods."""
     octaves = torch.arange(OCTAVES, device=lengths_m.device, dtype=lengths_m.dtype)
