@@ -6,12 +6,12 @@ import torch
 import trimesh
 from parts_of_rooms import CORNER, TABLE
 
-from sceneprior.core.parts import Stretch, filled_cells, surface_of_parts
+from sceneprior.core.parts import filled_cells
 from sceneprior.core.views import DecodedScenes
 from sceneprior.lifted.prototype_decoder import PrototypeConfig, PrototypeDecoder
-from sceneprior.lifted.prototypes import POSES, Prototypes, turned_extents
+from sceneprior.lifted.prototypes import Prototypes
 from sceneprior.lifted.rooms import PosedScenes
-from sceneprior.lifted.shape_morphing import appearances_of, posed_parts, stretched_parts
+from sceneprior.lifted.shape_morphing import appearances_of
 
 STEPS = 129
 
@@ -48,19 +48,6 @@ def test_an_object_that_comes_and_goes_has_its_own_looks_each_time():
     assert appearances_of(looks, np.zeros(STEPS, bool)) == []
     (once,) = appearances_of(looks, np.arange(STEPS) == 10)
     assert once.at(10 / 128) == (1, 1, 0.0)
-
-
-def test_parts_pose_and_stretch_as_the_mesh_of_their_look_does(decoder):
-    box_m = np.array([0.0, 0, 0, 1.7, 0.9, 1.2])
-    for look in range(2 * POSES):
-        own = posed_parts(decoder.parts(look // POSES), look % POSES)
-        size_m = turned_extents(decoder.sizes_m[look // POSES][None].double().numpy(), look % POSES)
-        parts = stretched_parts(own, Stretch.of(own, size_m[0]), box_m[3:])
-        vertices, faces = surface_of_parts(parts)
-        here, there = trimesh.Trimesh(vertices * box_m[3:], faces), decoder.mesh(look, box_m)
-        mesh = trimesh.Trimesh(there.vertices_m, there.faces)
-        assert here.volume == pytest.approx(mesh.volume, rel=0.01)
-        np.testing.assert_allclose(here.center_mass, mesh.center_mass, atol=2e-3)
 
 
 def decoded(looks) -> DecodedScenes:

@@ -16,7 +16,7 @@ from sceneprior.core.classes import VOID
 from sceneprior.core.dataset import BLANK, ViewDataset, allowed_views
 from sceneprior.core.errors import ShardError
 from sceneprior.core.wall_lines import find_walls
-from sceneprior.lifted.lifting import ShapeGrid, boxes, cache, prototype_fitting
+from sceneprior.lifted.lifting import ShapeGrid, boxes, cache
 from sceneprior.lifted.lifting.dataset import LiftedDataset
 from sceneprior.lifted.prototypes import POSES, turn_of
 
@@ -78,27 +78,6 @@ def test_what_has_no_label_or_no_box_has_no_look(shards):
 def test_a_blank_draw_is_a_room_in_which_there_is_nothing(shards):
     batch = LiftedDataset(shards, "train", shape=GRID).__getitems__([(0, BLANK)])
     assert not batch.is_object.any() and not batch.is_lifted.any()
-
-
-def test_parts_are_found_once_and_again_for_other_prototypes(shards, monkeypatch):
-    (shards / "lifted_parts_train.npz").unlink(missing_ok=True)
-    fitted, fit = [], prototype_fitting.fit_prototypes
-    monkeypatch.setattr(
-        prototype_fitting, "fit_prototypes", lambda *given: fitted.append(fit(*given)) or fitted[-1]
-    )
-    first = LiftedDataset(shards, "train", shape=GRID).find_prototypes(99)
-    data = LiftedDataset(shards, "train", shape=GRID)
-    again = data.find_prototypes(99)
-    assert len(fitted) == 1 and len(first.parts) > 1
-    for wanted, one, other in zip(fitted[0], first.parts, again.parts, strict=True):
-        for name in wanted._fields:
-            value = getattr(wanted, name)
-            np.testing.assert_array_equal(getattr(one, name), value, strict=True)
-            np.testing.assert_array_equal(getattr(other, name), value, strict=True)
-    np.testing.assert_array_equal(first.grids, again.grids)
-    # Other prototypes.
-    data.object_classes[data.object_classes == data.object_classes[0]] = VOID
-    assert len(data.find_prototypes(99).parts) < len(first.parts) and len(fitted) == 2
 
 
 def test_boxes_are_found_once_and_again_when_views_change(shards, monkeypatch):
