@@ -117,14 +117,13 @@ def draw_rooms(
                 sampler, conditions, own, draws, number, effort, rejections
             )
             # The first successful attempt counts, so later ones are overwritten.
-            done = [at for at in reversed(range(len(tried))) if best[at] >= 0]
-            for at in done:
-                shapes[tried[at][0]], missing[tried[at][0]] = own.shapes[at], tuple(lacking[at])
-            first = {tried[at][0]: at for at in done}
-            to, at = torch.tensor([*first]).long(), torch.tensor([*first.values()]).long()
+            first = {tried[at][0]: at for at in reversed(range(len(tried))) if best[at] >= 0}
+            for row, at in first.items():
+                shapes[row], missing[row] = own.shapes[at], tuple(lacking[at])
+            to, chosen = torch.tensor([*first]).long(), torch.tensor([*first.values()]).long()
             for whole, part in zip(_parts(rooms), _parts(particles.rooms), strict=True):
-                whole[to] = part[best[at]]
-            rectangle_m[to] = own.rectangle_m[at]
+                whole[to] = part[best[chosen]]
+            rectangle_m[to] = own.rectangle_m[chosen]
             finished |= first.keys()
         waiting = [row for row in waiting if row not in finished]
         number = attempts.stop

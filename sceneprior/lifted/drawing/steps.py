@@ -51,7 +51,10 @@ class Proposal(NamedTuple):
 
     def rows(self, rows: Int[Tensor, " fewer"]) -> "Proposal":
         """Some of these objects."""
-        return Proposal(*(part[rows] for part in self[:-1]), self.state.rows(rows))
+        return Proposal(
+            self.label[rows], self.look[rows], self.size_m[rows], self.bottom_m[rows],
+            self.state.rows(rows),
+        )  # fmt: skip
 
     def boxes_m(self, place_m: Float[Tensor, "some 2"]) -> Float[Tensor, "some 6"]:
         """Boxes of the objects at places (x, z)."""
@@ -119,8 +122,8 @@ def place_next(
     lost = ~particles.alive.unflatten(0, (-1, particles.each)).any(dim=1)
     for at in waiting[lost[room[waiting]] & plans.required[room[waiting], step]].tolist():
         row = int(rows[at])
-        own = state.rows(torch.tensor([at]))
-        reason = _search(sampler, particles, checks, row, own, step, draws[int(room[at])])
+        one = state.rows(torch.tensor([at]))
+        reason = _search(sampler, particles, checks, row, one, step, draws[int(room[at])])
         particles.alive[row] = not reason
         if reason:
             rejections[int(found.label[at]), reason] += 1
