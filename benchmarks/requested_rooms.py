@@ -23,7 +23,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -35,6 +35,7 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.shards import iterate_rooms
+from sceneprior.evaluation.metric import Comparison, RoomSet
 from sceneprior.evaluation.metrics.layout_classifier import layout_classifier_accuracy
 from sceneprior.lifted.requests.floors import Floor, RoomShape
 from sceneprior.lifted.requests.relations import OUTWARD, Furniture, RelationChecks
@@ -178,11 +179,13 @@ def accuracy(
     """`layout_classifier_accuracy` of a set of rooms, without an interval."""
     # The metric reads no pictures and no nearest rooms.
     own, others = (
-        SimpleNamespace(scenes=scenes, counts=np.ones((1, len(scenes)), dtype=int))
+        cast(RoomSet, SimpleNamespace(scenes=scenes, counts=np.ones((1, len(scenes)), dtype=int)))
         for scenes in (rooms, test)
     )
-    found = layout_classifier_accuracy(own, SimpleNamespace(test=others, real=real, seed=seed))
-    return round(float(found.value), 3)
+    compared = cast(Comparison, SimpleNamespace(test=others, real=real, seed=seed))
+    found = layout_classifier_accuracy(own, compared)
+    assert found.value is not None
+    return round(found.value, 3)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -34,6 +34,7 @@ import sceneprior
 from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.scene import Scene
 from sceneprior.core.shards import iterate_rooms
+from sceneprior.evaluation.metric import Comparison, RoomSet
 from sceneprior.evaluation.metrics.relations import relation_distance
 from sceneprior.paper.decode import decode_training_rooms
 
@@ -144,11 +145,12 @@ def relations(rooms: Sequence[Scene], real: Sequence[Scene], test: Sequence[Scen
     """`relation_distance_m` of a set of rooms, without an interval."""
     # The metric reads no pictures and no nearest rooms.
     own, others = (
-        SimpleNamespace(scenes=scenes, counts=np.ones((1, len(scenes)), dtype=int))
+        cast(RoomSet, SimpleNamespace(scenes=scenes, counts=np.ones((1, len(scenes)), dtype=int)))
         for scenes in (rooms, test)
     )
-    found = relation_distance(own, SimpleNamespace(test=others, real=real))
-    return float(found.value)
+    found = relation_distance(own, cast(Comparison, SimpleNamespace(test=others, real=real)))
+    assert found.value is not None
+    return found.value
 
 
 def plot(rows: Sequence[dict[str, Any]], path: Path) -> None:
