@@ -60,16 +60,16 @@ def test_a_mask_to_its_gradient(toy_shards):
         views = next(iter(make_loader(data, config.shape.batch_size, 0, 0)))
         module.training_step(views, 0).backward()
 
-    assert_short(files_of(trip), 33)
+    assert_short(files_of(trip), 26)
 
 
 def test_a_drawn_room_to_its_glb(prior, tmp_path):
     room = tmp_path / "room.glb"
-    assert_short(files_of(lambda: sceneprior.save(prior.sample(1)[0], room)), 34)
+    assert_short(files_of(lambda: sceneprior.save(prior.sample(1)[0], room)), 37)
 
 
 def test_a_wish_to_an_answer(prior):
-    assert_short(files_of(lambda: prior.sample(1, want="two nightstands")), 48)
+    assert_short(files_of(lambda: prior.sample(1, want="two nightstands")), 35)
 
 
 def assert_short(files: list[str], most: int) -> None:

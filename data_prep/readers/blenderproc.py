@@ -183,8 +183,9 @@ def _intrinsics(folder: Path) -> np.ndarray:
     try:
         K = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
+        reason = getattr(error, "strerror", None) or plain(str(error), 120)
         raise InputError(
-            f"{path} cannot be read ({plain(str(error), 120)}); it is the camera matrix that the "
+            f"{path} cannot be read ({reason}); it is the camera matrix that the "
             "authors' script writes beside the houses."
         ) from None
     if K.shape != (3, 3) or not np.isfinite(K).all() or min(K[0, 0], K[1, 1]) <= 0:
