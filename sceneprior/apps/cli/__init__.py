@@ -4,7 +4,6 @@
 """
 
 import atexit
-import errno
 import os
 import signal
 import sys
@@ -17,25 +16,6 @@ from typing import Any, NoReturn
 
 AGAIN_S = 0.5
 """Seconds until a dropped KeyboardInterrupt is raised again."""
-_ADVICE = {
-    errno.ENOSPC: "free space on its disk, or name another folder",
-    errno.EDQUOT: "free space in your quota, or name another folder",
-    errno.EFBIG: "its disk, or `ulimit -f`, allows no file of this size",
-    errno.EROFS: "name a folder that can be written",
-    errno.EACCES: "change its permissions, or name another folder",
-    errno.EPERM: "change its permissions, or name another folder",
-    errno.ENOENT: "check the path, or name another folder",
-    errno.ENOTDIR: "a file is where a folder is needed; name another folder",
-    errno.EEXIST: "a file is where a folder is needed; name another folder",
-    errno.EISDIR: "a folder is where a file is needed; name another file",
-    errno.ENOTEMPTY: "another process writes there; name another folder",
-    errno.ENAMETOOLONG: "choose a shorter name",
-    errno.EMFILE: "allow more open files with `ulimit -n 4096`",
-    errno.ENFILE: "close other programs: this machine has no more open files",
-    errno.EIO: "its disk or network fails; copy it elsewhere, or try again",
-    errno.ESTALE: "its network folder was lost; try again",
-}
-"""Advice on operating system errors, by number."""
 
 
 def main() -> None:
@@ -65,17 +45,10 @@ def _stopped() -> NoReturn:
 
 
 def _failed(error: Exception) -> NoReturn:
-    from sceneprior.core.errors import InputError
+    from sceneprior.apps.failures import sentence_of
 
-    if isinstance(error, InputError | FloatingPointError):
-        print(f"Error: {error}", file=sys.stderr)
-        sys.exit(2)
-    if isinstance(error, OSError) and error.errno in _ADVICE:
-        print(
-            f"Error: {error.filename or 'A file'} cannot be read or written ({error.strerror}); "
-            f"{_ADVICE[error.errno]}.",
-            file=sys.stderr,
-        )
+    if (sentence := sentence_of(error)) is not None:
+        print(f"Error: {sentence}", file=sys.stderr)
         sys.exit(2)
     if os.environ.get("SCENEPRIOR_DEBUG"):
         raise error

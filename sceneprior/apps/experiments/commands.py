@@ -6,6 +6,7 @@ reader who doubts a number can run the command again.
 
 import contextlib
 import gc
+import importlib
 import os
 import resource
 import shlex
@@ -21,6 +22,7 @@ from typing import Any
 
 import torch
 
+from sceneprior.apps.failures import sentence_of
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import only_writer, read_json, write_json
 
@@ -99,29 +101,34 @@ def run_command(
         for name in ("cpu_s", "wall_s"):
             known = took.get(name) is not None
             entry[name] = took[name] + end[name] - start[name] if known else None
-        entry["peak_memory_gib"] = max(took.get("peak_memory_gib") or 0.0, end["peak_memory_gib"])
+        if log is None:  # the peak of all commands so far: of a whole, not of one run among others
+            before = took.get("peak_memory_gib") or 0.0
+            entry["peak_memory_gib"] = max(before, end["peak_memory_gib"])
         entry["finished"] = finished
         write_json(folder / "steps.json", {**earlier, command.name: entry})
 
 
 def call(main: Main, arguments: list[str], log: Path | None) -> None:
     """Run a command; an InputError says why it failed."""
-    threads = torch.get_num_threads()
+    threads, precision = torch.get_num_threads(), torch.get_float32_matmul_precision()
     with contextlib.ExitStack() as until_done:
-        until_done.callback(torch.set_num_threads, threads)  # `fit` may have changed it
+        until_done.callback(torch.set_num_threads, threads)  # `fit` may change both
+        until_done.callback(torch.set_float32_matmul_precision, precision)
         until_done.callback(gc.collect)  # trainers and networks refer to each other
         if log is not None:
+            # Imports Lightning, whose log handlers keep the stderr of then; a log will be closed.
+            importlib.import_module("sceneprior.training.fit")
             output = until_done.enter_context(log.open("w"))
             until_done.enter_context(contextlib.redirect_stdout(output))
             until_done.enter_context(contextlib.redirect_stderr(output))
         try:
             status = main(arguments)
-        except (InputError, FloatingPointError) as error:
-            print(f"Error: {error}", file=sys.stderr)
-            raise InputError(str(error)) from None
         except Exception as error:
-            traceback.print_exc()
-            raise InputError(f"{type(error).__name__}: {error}") from None
+            if (sentence := sentence_of(error)) is None:
+                traceback.print_exc()
+                raise InputError(f"{type(error).__name__}: {error}") from None
+            print(f"Error: {sentence}", file=sys.stderr)
+            raise InputError(sentence) from None
     if status == STOPPED:  # `fit` saves its work first
         raise KeyboardInterrupt
     if status:

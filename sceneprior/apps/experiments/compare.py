@@ -95,6 +95,8 @@ def _finish(run: Run, commands: list[Command], main: Main) -> str | None:
                 run_command(main, command, run.folder, run.folder / f"{command.name}.log")
     except InputError as error:
         return str(error)
+    except OSError as error:
+        return f"{error.filename or run.folder} cannot be written ({error.strerror})"
     return None
 
 

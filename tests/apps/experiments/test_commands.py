@@ -1,7 +1,10 @@
 """Commands of experiments: what is recorded of one that ends, fails or is stopped."""
 
+import errno
 import json
 import signal
+import subprocess
+import sys
 from functools import partial
 
 import pytest
@@ -28,7 +31,11 @@ def test_a_command_is_printed_logged_recorded_and_done(version, tmp_path, capsys
     assert version.result.read_text().startswith("sceneprior 0.")
     noted = json.loads((tmp_path / "steps.json").read_text())["say"]
     assert noted["arguments"] == ["--version"] and noted["finished"]
-    assert 0 <= noted["cpu_s"] < 60 and noted["wall_s"] > 0 and 0 < noted["peak_memory_gib"] < 100
+    assert 0 <= noted["cpu_s"] < 60 and noted["wall_s"] > 0
+    assert "peak_memory_gib" not in noted  # a process that runs several knows only that of all
+    run_command(MAIN, version, tmp_path)
+    noted = json.loads((tmp_path / "steps.json").read_text())["say"]
+    assert 0 < noted["peak_memory_gib"] < 100
     assert is_done(version, tmp_path)
     assert not is_done(Command("say", ["--version"], version.result, ["b"]), tmp_path)
     version.result.unlink()
@@ -48,6 +55,7 @@ def test_a_failed_command_is_its_own_sentence_and_drops_what_came_after(version,
 def test_a_bug_is_a_sentence_with_its_traceback_in_the_log(tmp_path, monkeypatch):
     def broken(*given):
         torch.set_num_threads(2)
+        torch.set_float32_matmul_precision("high")
         raise KeyError("lamp")
 
     monkeypatch.setattr("sceneprior.apps.config.load_config", broken)
@@ -55,6 +63,32 @@ def test_a_bug_is_a_sentence_with_its_traceback_in_the_log(tmp_path, monkeypatch
     with pytest.raises(InputError, match=r"^KeyError: 'lamp'$"):
         run_command(MAIN, command, tmp_path, tmp_path / "fit.log")
     assert "Traceback" in (tmp_path / "fit.log").read_text() and torch.get_num_threads() == 1
+    assert torch.get_float32_matmul_precision() == "highest"
+
+
+def test_a_full_disk_is_a_sentence_with_advice(tmp_path, capsys):
+    def main(arguments):
+        raise OSError(errno.ENOSPC, "No space left on device", "scores.json")
+
+    with pytest.raises(InputError, match=r"No space left on device.*free space on its disk"):
+        run_command(main, Command("fit", ["fit"], tmp_path / "no", []), tmp_path)
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_lightning_keeps_no_closed_log():
+    code = """if True:
+        import importlib, logging, os, pathlib
+        from sceneprior.apps.experiments.commands import call
+
+        def main(arguments):
+            importlib.import_module("sceneprior.training.fit")
+
+        call(main, [], pathlib.Path(os.devnull))
+        loggers = [logging.getLogger(name) for name in list(logging.root.manager.loggerDict)]
+        streams = [getattr(each, "stream", None) for log in loggers for each in log.handlers]
+        assert any(streams) and not any(each.closed for each in streams if each)
+    """
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])

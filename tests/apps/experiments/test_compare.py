@@ -1,5 +1,6 @@
 """Comparisons: what is refused, which runs there are, and how a stopped one is continued."""
 
+import errno
 import json
 import shutil
 from functools import partial
@@ -203,6 +204,10 @@ def test_finished_commands_are_not_repeated_and_stay_in_the_table(begun, tmp_pat
     calls.error = InputError("no room for more.")
     done = again(begun, tmp_path, None)
     assert calls.names == ["fit"] and done.failures == ["toy, lstm, seed 3: no room for more."]
+    assert done.table.read_text() == table
+    calls.error = OSError(errno.ENOSPC, "No space left on device")
+    done = again(begun, tmp_path, None)
+    assert done.failures[0].endswith("lstm/seed3 cannot be written (No space left on device)")
     assert done.table.read_text() == table
 
 
