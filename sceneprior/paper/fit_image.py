@@ -14,7 +14,7 @@ from sceneprior.paper.losses import mask_loss
 from sceneprior.paper.matching import Matches
 from sceneprior.paper.prior import TrainedPrior
 from sceneprior.paper.view_loss import match_and_score, seen_boxes, seen_masks
-from sceneprior.training.steps import weighted_sum
+from sceneprior.training.steps import check_finite, weighted_sum
 
 CHECK_EVERY = 20
 """Steps between two checks of which images have converged."""
@@ -143,6 +143,7 @@ def fit_latents_to_images(
         x = points[active].requires_grad_()
         scenes = decode_images(trained, x, seen, with_shapes=False)
         loss = view_loss(trained, scenes, seen, masks)
+        check_finite(loss.total.sum(), seen.room_ids)
         gains = loss.score < best[active] * (1 - schedule.least_gain)
         stalled[active] = torch.where(gains, 0, stalled[active] + 1)
         better = active[loss.score < best[active]]

@@ -25,6 +25,7 @@ from sceneprior.paper.settings import (
 from sceneprior.paper.view_loss import match_and_score, proxy_boxes, seen_boxes, seen_masks
 from sceneprior.training.steps import (
     batch_seed,
+    check_finite,
     full_precision,
     log_losses,
     weighted_sum,
@@ -154,4 +155,6 @@ class ShapeStage(LatentStage):
             assert scenes.vertices_m is not None and faces is not None, "masks are of meshes"
             masks = seen_masks(scenes.vertices_m, faces, views, self.stage)
             losses["mask"], overlap = mask_loss(masks, views, matches, self.loss.iou_gate)
-            return self.total(losses, len(views.room_index), **overlap)
+            total = self.total(losses, len(views.room_index), **overlap)
+            check_finite(total, views.room_ids)
+            return total

@@ -65,7 +65,7 @@ def match_and_score(
     room.
 
     Raises:
-        FloatingPointError: the weighted sum of the losses is not finite.
+        FloatingPointError: the weighted sum of these losses is not finite.
     """
     matches = match_objects(scenes, boxes, views, weights.match_box, weights.occlusion_slack)
     losses = layout_losses(

@@ -9,6 +9,7 @@ from torch.nn import functional as F
 from torch.testing import assert_close
 
 from sceneprior.core.observed_image import as_views, images_of_split
+from sceneprior.paper import fit_image
 from sceneprior.paper.fit_image import FitSchedule, decode_images, fit_latents_to_images, view_loss
 
 SHORT = FitSchedule(steps=12, drop_at=8, patience=0)
@@ -54,6 +55,18 @@ def test_images_that_do_not_move_stop_early_and_others_go_on(trained, views, sta
     fit = fit_latents_to_images(trained, views, start, hopeless)
     # Nothing gains 200%: down at the first check, done at the second.
     assert fit.steps.tolist() == [40] * len(start)
+
+
+def test_masks_without_a_number_are_told_at_once(trained, views, start, monkeypatch):
+    mask_loss = fit_image.mask_loss
+
+    def poisoned(*args, **settings):
+        loss, overlap = mask_loss(*args, **settings)
+        return loss * torch.nan, overlap
+
+    monkeypatch.setattr(fit_image, "mask_loss", poisoned)
+    with pytest.raises(FloatingPointError, match=r"The loss is nan on rooms "):
+        fit_latents_to_images(trained, views, start, SHORT)
 
 
 def test_more_objects_than_the_prior_generates(trained, views, start):

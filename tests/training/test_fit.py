@@ -23,6 +23,7 @@ from typer.testing import CliRunner
 from sceneprior.apps.cli.commands import app
 from sceneprior.apps.config import load_config, load_run
 from sceneprior.core.files import only_writer
+from sceneprior.paper import stages
 from sceneprior.paper.stages import LayoutStage
 from sceneprior.training import fit as train
 from sceneprior.training.checkpoints import find_checkpoint, read_checkpoint
@@ -166,22 +167,36 @@ def test_ctrl_c_at_the_command_saves_and_resume_finishes(toy_shards, tmp_path, s
     assert find_checkpoint(run, ("layout", "shape")) == ("shape", run / "shape" / "final.ckpt")
 
 
-def test_a_loss_that_is_no_number_names_its_rooms(toy_shards, tmp_path, monkeypatch):
-    original = LayoutStage.training_step
+@pytest.mark.parametrize("stage", ["layout", "shape"])
+def test_a_loss_that_is_no_number_names_its_rooms(toy_shards, tmp_path, monkeypatch, stage):
+    """In the step in which it appears: in a latent, or first in the mask loss."""
+    step, mask_loss, poisoned = LayoutStage.training_step, stages.mask_loss, []
 
-    def poisoned(self, views, batch_idx):
+    def of_layouts(self, views, batch_idx):
+        poisoned.append("latent")
         with torch.no_grad():
             self.latents.weight[int(views.room_index[0])] = torch.nan
-        return original(self, views, batch_idx)
+        return step(self, views, batch_idx)
 
-    monkeypatch.setattr(LayoutStage, "training_step", poisoned)
+    def of_masks(*args, **settings):
+        poisoned.append("mask")
+        loss, overlap = mask_loss(*args, **settings)
+        return loss * torch.nan, overlap
+
+    if stage == "layout":
+        monkeypatch.setattr(LayoutStage, "training_step", of_layouts)
+    else:
+        monkeypatch.setattr(stages, "mask_loss", of_masks)
     with pytest.raises(FloatingPointError) as error:
         fit(tiny_config(toy_shards), tmp_path / "run", trainer_options=CPU)
     message = str(error.value)
     assert message.startswith("The loss is nan on rooms toy/train_")
-    assert message.count("toy/train_") == 5  # those of the batch
+    # Those of the batch.
+    assert message.count("toy/train_") == {"layout": 5, "shape": 6}[stage]
     assert "lower the learning rate" in message
-    assert not list((tmp_path / "run").rglob("*.ckpt"))  # after an error, nothing is saved
+    assert len(poisoned) == 1
+    # After an error, nothing is saved.
+    assert not list((tmp_path / "run" / stage).rglob("*.ckpt"))
 
 
 def test_settings_and_shards_that_do_not_fit(toy_run, toy_shards, tmp_path):
