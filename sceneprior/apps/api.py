@@ -216,7 +216,7 @@ class Prior:
             own |= {"floor": scene.floor_m, "openings": scene.openings or None}
             own |= {"ceiling_m": scene.ceiling_m}
         request = request_of({**own, **asked})
-        rooms = sample_rooms(self.trained, count, seed, None, request, "complete", classes)
+        rooms = sample_rooms(self.trained, count, seed, None, request, True, classes)
         rooms = self._told(rooms, seed=seed)
         return _with_models(rooms, scene.objects) if cad else rooms
 

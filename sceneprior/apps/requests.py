@@ -20,7 +20,10 @@ def load_request(path: str | Path) -> dict[str, Any]:
         raise InputError(
             f"{path} is not a request, which docs/requests.md describes: expected a JSON object."
         )
-    return RequestFile.of(str(path), **data).parts()
+    parts = RequestFile.of(str(path), **with_floor_of_file(data)).parts()
+    own = {key: part for key, part in parts.items() if key in data}
+    # A floor's file is only checked here, since options may add openings or a ceiling of their own.
+    return own | ({"floor": data["floor"]} if isinstance(data.get("floor"), str) else {})
 
 
 def request_of(asked: Mapping[str, Any]) -> RoomRequest | None:

@@ -7,6 +7,7 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.repeatable import check_seed, single_threaded
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.views import RoomBoxes
+from sceneprior.lifted.config import SAMPLER, TrainedLifted
 from sceneprior.lifted.drawing.scenes import drawn_by_sampler, sample_scenes
 from sceneprior.lifted.requests.request import RoomRequest
 from sceneprior.paper.decode import decode_latents
@@ -22,7 +23,7 @@ def sample_rooms(
     seed: int,
     distribution: str | None = None,
     request: RoomRequest | None = None,
-    prefix: str | None = None,
+    completes: bool = False,
     classes: Sequence[str] | None = None,
 ) -> list[Scene]:
     """Sample new rooms from a run of any method, by its sampler or a distribution of latents.
@@ -31,7 +32,8 @@ def sample_rooms(
 
     Args:
         request: What the rooms must meet; only a sampler can.
-        prefix: Start of the rooms' names; by default, they are named by the seed.
+        completes: Complete the room of the request, whose floor stays where it is, by the run's
+            sampler, whatever its default.
         classes: See `sample_scenes`.
 
     Raises:
@@ -44,15 +46,20 @@ def sample_rooms(
         )
     check_seed(seed)
     names = scene_names(count, seed)
-    if prefix is not None:
-        names = [f"{prefix}_{row:02d}" for row in range(count)]
+    if completes:
+        names = [f"complete_{row:02d}" for row in range(count)]
+        if isinstance(trained, TrainedLifted) and trained.sampler is not None:
+            distribution = SAMPLER
     own = drawn_by_sampler(trained, distribution) if isinstance(trained, TrainedPrior) else None
     if own is not None:
-        return sample_scenes(own, names, seed, request, classes)
+        return sample_scenes(own, names, seed, request, classes, floor_stays=completes)
     if request is not None or classes is not None:
+        others = "these rooms come from latents"
+        if not isinstance(trained, TrainedPrior):
+            others = f"`method: {trained.config.method}` has none"
         raise InputError(
-            "Floors, wishes and given objects need a sampler, but these rooms come from latents; "
-            "leave them out, or take a prior with a sampler."
+            f"Floors, wishes and given objects need a sampler, but {others}; leave them out, or "
+            "take a prior with a sampler."
         )
     if isinstance(trained, TrainedPrior):
         z, _ = draw_latents(trained, count, seed, distribution)

@@ -22,6 +22,7 @@ BLANK = -1
 """Epoch number that stands for padding: the room comes without objects."""
 TURNS = ("", "@90", "@180", "@270")
 """Suffixes of the ids of rooms rotated about +y, by number of quarter turns."""
+_OPEN_SHARDS = 32
 _Room = TypeVar("_Room")
 
 
@@ -300,6 +301,3 @@ class ViewDataset(RoomDataset):
             return generator.choice(allowed, self.views_per_room, replace=False)
         # In a room with too few views, all are repeated about equally often.
         return np.resize(generator.permutation(allowed), self.views_per_room)
-
-
-_OPEN_SHARDS = 32

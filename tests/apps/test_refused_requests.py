@@ -15,6 +15,7 @@ from sceneprior.core.scene import Opening, Scene, SceneObject
 
 BED = {"class": "double_bed", "center_m": [0.0, 0.3, -0.4], "size_m": [1.8, 0.6, 2.0]}
 REQUEST = {"format": "sceneprior-request", "version": 1}
+ENDS = {"kind": "door", "start_m": [0, 0], "end_m": [0.9, 0]}
 DOOR = Opening("door", (-0.5, 0.0), (0.4, 0.0), 0.0, 2.0)
 
 
@@ -109,6 +110,10 @@ FILES: dict[str, dict[str, Any]] = {
     "file_openings_number": {"openings": 5},
     "file_want_number": {"want": 5},
     "file_objects_number": {"objects": 5},
+    "file_opening_key": {"openings": [{**ENDS, "top": 2}]},
+    "file_opening_text": {"openings": [{**ENDS, "top_m": "2"}]},
+    "file_opening_text_end": {"openings": [{**ENDS, "start_m": ["0", 0]}]},
+    "file_floor_of_texts": {"floor": [["0", 0], [4, 0], [4, 3]]},
     "file_object_half": {"objects": [{"class": "desk"}]},
 }
 

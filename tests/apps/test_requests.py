@@ -66,6 +66,21 @@ def test_a_floor_of_a_file_brings_its_door(prior, tmp_path):
     assert room.openings == (door,) and (room.floor_m == outline).all()
     (room,) = prior.sample(1, floor=f"{tmp_path}/plan.json", openings="window@north")
     assert [each.kind for each in room.openings] == ["window"]
+    # ... and in a file of its own, to which the options may add.
+    asked = {"floor": f"{tmp_path}/plan.json:plan"}
+    read = load_request(written(tmp_path, **asked, openings=[], objects=[], want=None))
+    assert read == {**asked, "ceiling_m": 2.6}
+    (room,) = prior.sample(1, **read)
+    assert room.openings == (door,) and room.ceiling_m == 2.6
+
+
+def test_an_empty_room_is_completed_where_it_stands(prior):
+    corners = [[0.0, 0], [4, 0], [4, 3], [0, 3]]
+    scene = Scene("mine", "front3d_bedroom", (), np.array(corners))
+    for asked in ({}, {"classes": ["double_bed"]}):
+        (room,) = prior.complete(scene, 1, **asked)
+        assert room.floor_m.tolist() == corners
+        assert ((room.centers_m > 0) & (room.centers_m < [4, 3, 3])).all() and room.objects
 
 
 def test_a_room_with_walls_is_completed_between_them(prior):

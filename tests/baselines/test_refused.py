@@ -13,6 +13,7 @@ from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.errors import ConfigError, ShardError
 from sceneprior.core.observed_image import images_of_split
 from sceneprior.core.shards import Shard
+from sceneprior.lifted.requests.request import RoomRequest
 from sceneprior.paper.decode import decode_training_rooms
 from sceneprior.paper.sampling import read_latent
 from sceneprior.training.fit import fit
@@ -82,6 +83,7 @@ def test_tasks_that_need_latents(baseline_run):
         "load_run": lambda: load_run(run),
         "decode": lambda: decode_training_rooms(atiss),
         "kernel": lambda: sample_rooms(atiss, 2, 0, "kernel"),
+        "floor": lambda: sample_rooms(atiss, 2, 0, request=RoomRequest.of(floor="4x3")),
         "gan_decode": lambda: decode_training_rooms(gan),
         "gan_latent": lambda: read_latent(gan, "typo"),
         "gan_reconstruct": lambda: reconstruct(gan, [], FitOptions()),

@@ -258,8 +258,9 @@ class RequestFields:
         self.rest_text = gui.add_html(rest, visible=bool(self._rest))
 
     def text(self, key: str) -> str:
-        """What is written in a field."""
-        return str(self.fields[key].value).strip()
+        """What is written in a field, without commas after the last door."""
+        text = str(self.fields[key].value).strip()
+        return text.strip(",") if key == "openings" else text
 
     def asked(self) -> dict[str, Any]:
         """The request as arguments of `Prior.sample`; texts that name files are refused.

@@ -50,6 +50,7 @@ def sample_scenes(
     seed: int,
     request: RoomRequest | None = None,
     classes: Sequence[str] | None = None,
+    floor_stays: bool = False,
 ) -> list[Scene]:
     """Sample a room with meshes for each name; see `draw_rooms`.
 
@@ -59,6 +60,7 @@ def sample_scenes(
     Args:
         classes: Classes of the objects to add to the given ones, and no others; instead of wishes.
             `extra["no_place"]` lists those for which no place was found.
+        floor_stays: Never move the floor; otherwise, a floor without given objects is centred.
 
     Raises:
         InputError: the prior does not understand the request, or no room meets it.
@@ -74,7 +76,8 @@ def sample_scenes(
         whole = Counter(classes) + Counter(item.label for item in request.objects)
         want = {label: whole[label] for label in known}
         request = RoomRequest(**{**request.parts(), "want": want})
-    conditions = request.conditions(known, trained.config.label_set, sampler.max_objects)
+    labels, most = trained.config.label_set, sampler.max_objects
+    conditions = request.conditions(known, labels, most, floor_stays)
     drawn = draw_rooms(sampler, conditions, len(names), seed, may_lack=classes is not None)
     told = {key: part for key, part in request.parts().items() if key != "objects"}
     scenes = []

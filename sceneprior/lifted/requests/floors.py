@@ -9,6 +9,7 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
+from sceneprior.core.checked import number_array
 from sceneprior.core.errors import InputError
 from sceneprior.core.outline import Wall, nearest_wall, rectangle, walls_of
 from sceneprior.core.scene import Opening
@@ -108,7 +109,7 @@ def read_floor(floor: str | Sequence[Any] | np.ndarray) -> np.ndarray:
     if isinstance(floor, str):
         floor = _floor_of_text(floor)
     try:
-        outline_m = np.array(floor, dtype=np.float64)
+        outline_m = number_array(floor)
     except (TypeError, ValueError):
         outline_m = np.zeros(0)
     if outline_m.ndim != 2 or len(outline_m) < 3 or outline_m.shape[1] != 2:

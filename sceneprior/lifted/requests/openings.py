@@ -4,11 +4,12 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import shapely
 from jaxtyping import Float
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from sceneprior.core.checked import shown
 from sceneprior.core.errors import InputError
@@ -31,6 +32,21 @@ PLACES = 50
 COMPASS = {"north": (0.0, -1.0), "east": (1.0, 0.0), "south": (0.0, 1.0), "west": (-1.0, 0.0)}
 """Directions (x, z) out of the room by the names of walls. North is up in top-down pictures."""
 _TEXT = re.compile(r"\s*(door|window)s?(?:\s*@\s*(\w+)(?:\s*:\s*(\d+\.?\d*))?)?\s*")
+
+
+_Pair = Annotated[tuple[float, float], Field(strict=False)]
+
+
+class _OpeningEntry(BaseModel):
+    """A door or window with both ends, as in a scene's JSON."""
+
+    model_config = ConfigDict(strict=True, extra="forbid")
+
+    kind: Literal["door", "window"]
+    start_m: _Pair
+    end_m: _Pair
+    bottom_m: float | None = None
+    top_m: float | None = None
 
 
 @dataclass(frozen=True)
@@ -73,26 +89,25 @@ def _read_opening(entry: Any) -> Opening | WantedOpening:
         return entry
     if isinstance(entry, Mapping):
         try:
-            start, end = (tuple(map(float, entry[key])) for key in ("start_m", "end_m"))
-            _, bottom, top = DOOR_M if entry["kind"] == "door" else WINDOW_M
-            bottom, top = float(entry.get("bottom_m", bottom)), float(entry.get("top_m", top))
-            if entry["kind"] in ("door", "window") and len(start) == len(end) == 2:
-                return Opening(entry["kind"], start, end, bottom, top)
-        except (KeyError, TypeError, ValueError):
-            pass
-        raise InputError(
-            f"An opening is {str(dict(entry))[:80]}; expected kind (door or window), start_m and "
-            "end_m as [x, z], and bottom_m and top_m where they differ from the usual."
-        )
-    found = _TEXT.fullmatch(entry) if isinstance(entry, str) else None
-    if found is None or not (found[2] is None or found[2] in COMPASS or found[2].isdecimal()):
+            found = _OpeningEntry.model_validate(dict(entry))
+        except ValidationError:
+            raise InputError(
+                f"An opening is {str(dict(entry))[:80]}; expected kind (door or window), start_m "
+                "and end_m as [x, z], and bottom_m and top_m where they differ from the usual."
+            ) from None
+        _, bottom_m, top_m = DOOR_M if found.kind == "door" else WINDOW_M
+        bottom_m = bottom_m if found.bottom_m is None else found.bottom_m
+        top_m = top_m if found.top_m is None else found.top_m
+        return Opening(found.kind, found.start_m, found.end_m, bottom_m, top_m)
+    text = _TEXT.fullmatch(entry) if isinstance(entry, str) else None
+    if text is None or not (text[2] is None or text[2] in COMPASS or text[2].isdecimal()):
         raise InputError(
             f"An opening is {str(entry)[:40]!r}; expected door, window@north or door@south:1.5 (a "
             f"wall is {', '.join(COMPASS)} or a number; then metres along it)."
         )
-    wall = int(found[2]) if found[2] and found[2].isdecimal() else found[2]
-    at_m = None if found[3] is None else float(found[3])
-    kind: Literal["door", "window"] = "door" if found[1] == "door" else "window"
+    wall = int(text[2]) if text[2] and text[2].isdecimal() else text[2]
+    at_m = None if text[3] is None else float(text[3])
+    kind: Literal["door", "window"] = "door" if text[1] == "door" else "window"
     return WantedOpening(kind, wall, at_m)
 
 

@@ -179,11 +179,14 @@ class RoomRequest(BaseModel):
         found = {name: getattr(self, name) for name in RoomRequest.model_fields}
         return {name: part for name, part in found.items() if part not in (None, [], ())}
 
-    def conditions(self, known: Sequence[str], label_set: str, most: int) -> "Conditions":
+    def conditions(
+        self, known: Sequence[str], label_set: str, most: int, stays: bool = False
+    ) -> "Conditions":
         """The request as a prior understands it.
 
         Without given objects, the floor is moved so that the centre of its bounding box is the
-        origin. A door or a window to which a relation refers is added if there is none.
+        origin, unless it `stays`. A door or a window to which a relation refers is added if there
+        is none.
 
         Args:
             known: Classes that the prior draws.
@@ -209,7 +212,7 @@ class RoomRequest(BaseModel):
         for kind in OPENINGS:
             if kind in targets and all(each.kind != kind for each in openings):
                 openings += read_openings(kind)
-        if outline_m is not None and not self.objects:
+        if outline_m is not None and not (self.objects or stays):
             middle = (outline_m.min(axis=0) + outline_m.max(axis=0)) / 2
             outline_m, openings = outline_m - middle, moved(openings, -middle)
         classes = tuple(label_set_of(label_set))

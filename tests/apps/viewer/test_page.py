@@ -88,7 +88,7 @@ def test_a_request_is_answered_or_refused_in_the_panel(prior, tmp_path):
         page, request, fields = panel.page, panel.request, panel.request.fields
         assert "The command also requests: floor, want." in request.rest_text.content
         assert "✓ 2 nightstand" in panel._wishes_text.content
-        fields["want"].value, fields["openings"].value = "double_bed: 1", "door@south"
+        fields["want"].value, fields["openings"].value = "double_bed: 1", "door@south,"
         panel.sample(page.source, 1, None)
         assert page.shown.origin == "seed 1, from: sampler, as requested"
         assert "✓ 1 double bed" in panel._wishes_text.content

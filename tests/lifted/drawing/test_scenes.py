@@ -52,6 +52,19 @@ def test_rooms_come_from_the_sampler_and_others_if_asked(sampler_run, few_attemp
     assert early.distribution == "paper" and sample_rooms(early, 2, 0)[0].latent is not None
 
 
+def test_a_sampler_completes_rooms_of_a_run_that_draws_others_from_latents(sampler_run):
+    prior = sceneprior.load(sampler_run)
+    with_latents = prior.trained.config.model_dump(mode="json", by_alias=True)
+    with_latents["sampling"]["distribution"] = "paper"
+    config = type(prior.trained.config).model_validate(with_latents)
+    other = replace(prior, trained=replace(prior.trained, config=config))
+    assert other.distribution == "paper"
+    scene = Scene("mine", "front3d_bedroom", (BED,))
+    rooms = [each.complete(scene, 1, seed=2)[0] for each in (prior, other)]
+    assert rooms[0].objects[0].center_m == BED.center_m
+    np.testing.assert_array_equal(rooms[0].centers_m, rooms[1].centers_m)
+
+
 def test_runs_without_a_sampler_say_so(toy_run):
     prior = sceneprior.load(toy_run)
     with refused("requests/no_sampler"):
