@@ -57,7 +57,7 @@ ELSEWHERE = {
     "make test": "this is it",
     "out/small/": "tests/test_readme.py runs the block with nothing cut short",
     "compare/paper.yaml": "tests/apps/experiments/test_compare.py compares toys",
-    "compare/single_view.yaml": "tests/apps/experiments/test_compare_views.py compares toys",
+    "compare/single_view.yaml": "tests/apps/experiments/test_compare.py compares toys",
     "--devices 2": "tests/training/test_processes.py trains in two processes",
     "--devices 4 --resume": "tests/training/test_slurm.py is stopped and queued again as there",
     "python benchmarks/": "a measurement, of runs that take hours",

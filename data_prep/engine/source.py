@@ -103,7 +103,7 @@ class Source(Protocol):
         label_set: Name of the label set, for `sceneprior.core.classes.label_set`.
         room_type: Type of the rooms; also in the shards' names: `train/<room_type>_0000.h5`.
         draws: True if `prepare` needs a renderer; otherwise it gets None.
-        only: Requested part: HOUSE, HOUSE/ROOM or a room id (selection.py); None for everything.
+        only: Requested part: HOUSE, HOUSE/ROOM or a room id (plan.py); None for everything.
     """
 
     @property

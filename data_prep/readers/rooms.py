@@ -14,9 +14,9 @@ from data_prep.readers.heading import find_turn, note_of_turn, turn_matrix
 from data_prep.readers.scanned_mesh import moved, surface_of, unoccluded
 from data_prep.readers.upright import find_floor
 from sceneprior.core.boxes import CUBE_CORNERS
-from sceneprior.core.classes import VOID
+from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.id_tables import IdTable
+from sceneprior.core.id_tables import IdTable, tidy
 from sceneprior.core.observations import Observations, observe
 from sceneprior.core.outline import rectangle
 from sceneprior.core.scene import Mesh
@@ -103,11 +103,11 @@ def numbered(
         stuff: (views, height, width) indices into `STUFF`.
     """
     made = {"where": where, "stuff": None if stuff is None else thinned_stuff(stuff)}
-    try:
-        table = IdTable(classes, label_set_name, where)
-    except InputError:  # none of the classes is in the label set: nothing to see
+    names = {tidy(name) for name in label_set(label_set_name)} - {"void"}
+    if not names & {tidy(name) for name in classes.values()}:  # nothing to see
         nothing = np.zeros(numbers.shape, np.uint8)
         return made | {"ids": nothing, "object_class": np.array([VOID]), "notes": notes}
+    table = IdTable(classes, label_set_name, where)
     return made | {
         "ids": table.ids(numbers),
         "object_class": table.classes,

@@ -147,8 +147,9 @@ _TILES = (
      "real test rooms {mean_objects_test:.2f}"),
     ("class_accuracy", "{0:%}", "of true objects with the right class",
      "decoded training rooms, matched by box"),
-    ("mask_iou_held_out", "{0:.2f}", "mean mask IoU in held-out views", "decoded training rooms"),
-    ("mask_iou_training_views", "{0:.2f}", "mean mask IoU in training views",
+    ("mask_iou_held_out", "{0:.2f}", "mean soft mask IoU in held-out views",
+     "decoded training rooms"),
+    ("mask_iou_training_views", "{0:.2f}", "mean soft mask IoU in training views",
      "decoded training rooms; data.view_fraction below 1 holds views out"),
     ("box_iou_3d", "{0:.2f}", "mean 3D box IoU", "decoded training rooms; training uses no 3D"),
 )  # fmt: skip

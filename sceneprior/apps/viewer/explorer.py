@@ -23,6 +23,8 @@ from sceneprior.paper.interpolate import RoomPath, even_places
 from sceneprior.paper.prior import TrainedPrior, with_training_latents
 from sceneprior.paper.sampling import DISTRIBUTIONS, named_latent
 
+SOME = 64
+"""Most training rooms from which the size of rooms is estimated."""
 PATH_STEPS = 49
 """Number of rooms of a path with both ends; neighbours are rarely more than 4 degrees apart."""
 HERE = "here"
@@ -198,19 +200,24 @@ class Explorer:
         return self.training_room(row), distance_m
 
     def layouts(self) -> Sequence[Scene]:
-        """Rooms from which the size of rooms is estimated: training rooms, or a few new ones."""
+        """Rooms from which the size of rooms is estimated: some training rooms, or new ones."""
         if self.map is not None:
-            return self._training_layouts
+            most = len(self._training_z)
+            return self._boxes_of(range(0, most, -(-most // SOME)))
         return self.prior.sample(16, 0, next(iter(self.distributions), None))
 
     @cached_property
     def _training_layouts(self) -> list[Scene]:
+        return self._boxes_of(range(len(self._training_z)))
+
+    def _boxes_of(self, rows: Sequence[int]) -> list[Scene]:
         """Training rooms as the prior decodes them, without shapes; a second for 500 rooms."""
         trained = self.prior.with_latents
         with torch.no_grad():
-            decoded = trained.prior.decode(self._training_z, with_shape=False)
+            decoded = trained.prior.decode(self._training_z[list(rows)], with_shape=False)
+        names = [trained.room_ids[row] for row in rows]
         target = trained.config.model.completeness_target
-        rooms = to_rooms(decoded, trained.prior, self.label_set, trained.room_ids, target)
+        rooms = to_rooms(decoded, trained.prior, self.label_set, names, target)
         return [room.scene for room in rooms]
 
 

@@ -81,6 +81,8 @@ class Page:
         self._direction = CORNER if self.board is None else FRONT
         self._bounds_m = np.zeros((2, 3))
         """Lowest and highest corner of the room when it was framed."""
+        self._eyes: dict[int, np.ndarray] = {}
+        """Where the page has put each browser's camera."""
         server.scene.set_up_direction("+y")
         server.initial_camera.fov = FOV_RAD
         self.show(self.shown)
@@ -135,18 +137,20 @@ class Page:
         if turned or abs(forward[1]) > 0.99:
             forward = self._direction
         with client.atomic():
-            camera.position, camera.look_at = framed(
-                self._points(), forward, camera.fov, camera.aspect
-            )
+            eye, camera.look_at = framed(self._points(), forward, camera.fov, camera.aspect)
+            camera.position = self._eyes[client.client_id] = eye
 
     def _connected(self, client: "viser.ClientHandle") -> None:
-        """Frame the room in a new browser's window, and again when the window changes its shape."""
+        """Frame the room in a new browser's window, and again when the window changes its shape,
+        unless the user has moved the camera."""
         aspect = 0.0
 
         def update(camera: Any) -> None:
             nonlocal aspect
-            if abs(camera.aspect - aspect) > 0.01:
-                aspect = camera.aspect
+            own = self._eyes.get(client.client_id)
+            reshaped = abs(camera.aspect - aspect) > 0.01
+            aspect = camera.aspect
+            if own is None or (reshaped and np.allclose(camera.position, own, atol=0.02)):
                 self._place(client, turned=True)
 
         update(client.camera)

@@ -49,7 +49,7 @@ def frechet_distance(
 
     Args:
         a, b: One feature vector per image; the sizes of the sets may differ.
-        counts_a, counts_b: How often each row is in its set (see bootstrap.py); None: once.
+        counts_a, counts_b: How often each row is in its set (see metric.py); None: once.
 
     Returns:
         The squared distance, as FID reports it, never below 0. It falls with n even for samples of

@@ -54,9 +54,9 @@ class Renderer(abc.ABC):
         """Draw a shaded picture, (H, W, 3) uint8, with mesh k in the colour `colors[k]`.
 
         The light comes from the camera. If the camera is a `Pinhole`, the first `shadowed` meshes
-        also shadow each other softly under light from the sky (`sky.py`). The other meshes, such as
-        walls, are lit almost evenly if `shadowed` is not 0. The background is a colour, or a
-        picture of the same size. Both renderers draw this with the software z-buffer, so that
+        also shadow each other softly under light from the sky (`zbuffer.py`). The other meshes,
+        such as walls, are lit almost evenly if `shadowed` is not 0. The background is a colour, or
+        a picture of the same size. Both renderers draw this with the software z-buffer, so that
         pictures look the same everywhere.
         """
         height, width = image_size

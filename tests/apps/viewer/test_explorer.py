@@ -10,6 +10,7 @@ from tiny_runs import tiny_baseline
 
 import sceneprior
 from sceneprior.apps.api import Prior
+from sceneprior.apps.viewer import explorer as explorers
 from sceneprior.apps.viewer.explorer import PATH_STEPS, Explorer, Folder, Shown, floor_side_m
 from sceneprior.apps.viewer.latent_map import SNAP, make_map
 from sceneprior.core.errors import InputError
@@ -96,6 +97,12 @@ def test_the_nearest_training_room(explorer, prior):
     shown, distance_m = explorer.nearest(rooms[4])
     assert distance_m == pytest.approx(0, abs=1e-4)
     assert same(shown.scene, next(room for room in rooms if room.name == shown.scene.name))
+
+
+def test_a_page_waits_for_some_training_rooms_only(prior, monkeypatch):
+    monkeypatch.setattr(explorers, "SOME", 4)
+    explorer, rooms = Explorer(prior), prior.trained.room_ids
+    assert [room.name for room in explorer.layouts()] == list(rooms[:: -(-len(rooms) // 4)])
 
 
 def test_without_latents_there_are_new_rooms_and_no_map(prior, toy_shards):

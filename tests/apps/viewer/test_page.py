@@ -3,7 +3,9 @@
 import io
 import json
 import zipfile
+from contextlib import nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -118,6 +120,20 @@ def test_a_request_is_answered_or_refused_in_the_panel(prior, tmp_path):
             fields["floor"].value = text
             with refused("viewer/floor_of_a_file", text=text[:60]):
                 request.asked()
+
+
+def test_a_camera_that_the_user_has_moved_stays_when_the_window_changes_its_shape():
+    camera = SimpleNamespace(aspect=1.3, fov=0.75, wxyz=(1.0, 0, 0, 0), on_update=lambda f: None)
+    client = SimpleNamespace(client_id=7, camera=camera, atomic=nullcontext)
+    camera.on_update = lambda update: setattr(camera, "update", update)
+    with serving("127.0.0.1", 0) as server:
+        page = open_page(server, Folder([ROOM]), "rooms").page
+        page._connected(client)
+        for turned in (False, True):
+            before = camera.position = camera.position + turned
+            camera.aspect /= 2
+            camera.update(camera)
+            assert np.array_equal(camera.position, before) == turned
 
 
 def test_models_and_a_nearest_room_come_and_go(toy_run):

@@ -193,6 +193,11 @@ def test_a_room_of_walls_alone_shows_no_object(room, tmp_path):
     assert line.rule == "no_view" and line.reason == "none of its 4 views shows any object"
 
 
+def test_an_unknown_label_set_is_no_room_without_objects():
+    with pytest.raises(InputError, match="bedrom"):
+        numbered(np.zeros((1, 4, 4), np.int32), {1: "bed"}, "bedrom", "here")
+
+
 def relabel(scene, **names):
     path = scene / "scans/segments_anno.json"
     groups = json.loads(path.read_text())["segGroups"]
