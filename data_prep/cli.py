@@ -304,11 +304,12 @@ def inspect(
 def _verify(shards: Path, room: str | None, workers: int) -> None:
     from rich.console import Console
 
-    from data_prep.inspection.tables import check_table, summary
+    from data_prep.inspection.tables import check_tables, summary
     from data_prep.inspection.verify import verify
 
     found = verify(shards, room, workers)
-    Console().print(check_table(found))
+    for table in check_tables(found):
+        Console().print(table)
     for sentence in found.problems[1:_PROBLEMS_SHOWN]:
         typer.echo(sentence, err=True)
     if found.problems:

@@ -2,9 +2,10 @@
 
 from collections import Counter
 from collections.abc import Sequence
+from operator import itemgetter
 from pathlib import Path
 
-from rich.table import Table
+from rich.table import Column, Table
 
 from data_prep.engine.report import make_table
 from data_prep.engine.source import SPLITS
@@ -16,6 +17,7 @@ from data_prep.inspection.verify import FolderCheck, RoomCheck, agreement_of, ev
 from sceneprior.core.classes import label_set
 from sceneprior.core.shards import Shard, iterate_rooms, read_index
 
+_WORST_SHOWN = 5
 _JUDGED = ("fit of cameras", "in 3D", "masks within", "mean 2D IoU")
 
 
@@ -80,14 +82,27 @@ def room_table(folder: Path, room_id: str) -> Table:
     return table
 
 
-def check_table(found: FolderCheck) -> Table:
-    """Results of a check, split by split."""
+def check_tables(found: FolderCheck) -> list[Table]:
+    """Results of a check: each split, and the rooms that agree least."""
     totals = []
     for split, checks in found.rooms.items():
         rooms = [check for check in checks if check.room_id]
         views, sums = sum(room.views for room in rooms), sum(room.has_checksum for room in rooms)
         totals.append((split, len(rooms), views, f"{sums} rooms", *_judged(checks)))
-    return make_table(("split", "rooms", "views", "checksums", *_JUDGED), totals)
+    tables = [make_table(("split", "rooms", "views", "checksums", *_JUDGED), totals)]
+    if judged := [(least, check) for check in found.every if (least := _least(check)) is not None]:
+        worst = [check for _, check in sorted(judged, key=itemgetter(0))[:_WORST_SHOWN]]
+        # Ids are folded, because their ends, the rooms' names, must survive narrow terminals.
+        columns = (Column("worst rooms", overflow="fold"), *_JUDGED)
+        tables.append(make_table(columns, [(check.room_id, *_judged([check])) for check in worst]))
+    return tables
+
+
+def _least(check: RoomCheck) -> float | None:
+    """Lowest share or fit of a room; None if nothing determines any."""
+    fit = _fit([check])
+    shares = [tally.share for tally in check.agreement.values()]
+    return min([*shares, *([] if fit is None else [fit])], default=None)
 
 
 def _fit(checks: Sequence[RoomCheck]) -> float | None:

@@ -10,11 +10,13 @@ from golden import hold
 from PIL import Image
 from posed_files import SET, PosedRoom
 from refusals import refused
+from rich.console import Console
 
 from data_prep.engine.build import Job, build_shards
+from data_prep.inspection.agreement import Tally
 from data_prep.inspection.sheet import draw_sheet, legend
-from data_prep.inspection.tables import count_tables, room_table
-from data_prep.inspection.verify import verify
+from data_prep.inspection.tables import check_tables, count_tables, room_table
+from data_prep.inspection.verify import FolderCheck, RoomCheck, verify
 from data_prep.readers.posed.reader import Posed
 from sceneprior.core.boxes import yaw_rotation
 
@@ -105,6 +107,18 @@ def test_verify_prints_the_overlap_and_exits_with_3_where_something_is_wrong(sha
     last = wrong.stderr.strip().splitlines()[-1]
     assert last.startswith(f"Error: {paths[0]}, room ") and "its checksum does not match" in last
     assert last.endswith("(3 more problems, listed above)")
+
+
+def test_the_worst_rooms_keep_their_names_in_a_narrow_terminal():
+    name = "2bc95aea-aa71-57ad-9ed2-3852b7420110_LivingDiningRoom-1010"
+    checks = [
+        RoomCheck("a", f"{name}{k}", agreement={"mesh": Tally("mesh", 9, k)}) for k in range(9)
+    ]
+    console = Console(width=60, record=True)
+    console.print(check_tables(FolderCheck({"train": checks[::-1]}, ()))[1])
+    rows = [line for line in console.export_text().splitlines() if line.startswith("│")]
+    said = "".join(line.split("│")[1].strip() for line in rows)
+    assert said == "".join(f"{name}{k}" for k in range(5))
 
 
 def test_verify_says_what_it_could_not_check(shards, cli):
