@@ -137,6 +137,16 @@ def report_csv(lines: Iterable[Line]) -> str:
     return table.getvalue()
 
 
+def _compared(of: str, official: dict[str, int], counts: dict[str, Any]) -> dict[str, Any]:
+    found = {split: count["rooms"] for split, count in counts.items()}
+    found |= {what: sum(count[what] for count in counts.values()) for what in _COUNTS}
+    rows = [
+        {"what": what, "expected": count, "found": found[what], "difference": found[what] - count}
+        for what, count in official.items()
+    ]
+    return {"of": of, "rows": rows}
+
+
 @dataclass(frozen=True)
 class Summary:
     """The totals of a job."""
@@ -164,13 +174,15 @@ class Summary:
     @property
     def report(self) -> dict[str, Any]:
         """Contents of `report.json`."""
-        about = {
+        about: dict[str, Any] = {
             "source": self.source.name,
             "room_type": self.source.room_type,
             "label_set": self.source.label_set,
             "renderer": self.renderer,
             "summary": str(self),
         }
+        if self.source.official is not None:
+            about["expected"] = _compared(*self.source.official, self.counts)
         return make_report(self.lines, about)
 
     def __str__(self) -> str:
@@ -236,6 +248,11 @@ def report_tables(report: dict[str, Any]) -> list[Table]:
         more = [(f"and {len(failed) - _FAILURES_SHOWN} more", "report.csv lists all of them")]
         rows = failed[:_FAILURES_SHOWN] + more * (len(failed) > _FAILURES_SHOWN)
         tables.append(make_table((Column("failed", overflow="fold"), "why"), rows))
+    if expected := report.get("expected"):
+        columns = ("what", "expected", "found", "difference")
+        cells = [[row[name] for name in columns] for row in expected["rows"]]
+        rows = [(*others, f"{more:+d}" if more else "as expected") for *others, more in cells]
+        tables.append(make_table(columns, rows, expected["of"]))
     return tables
 
 

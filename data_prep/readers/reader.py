@@ -84,6 +84,11 @@ class Reader(ABC):
         """Type of the rooms; also in the shards' names."""
         return self.name
 
+    @property
+    def official(self) -> tuple[str, dict[str, int]] | None:
+        """See `Source.official`."""
+        return None
+
     @abstractmethod
     def scenes(self) -> list[str]:
         """Sorted names of the scenes."""
