@@ -103,6 +103,23 @@ def test_above_the_floor_is_relu_and_keeps_the_gradient_that_lifts():
     assert y.grad.tolist() == [-3.0, 0.0, -3.0, -3.0, 3.0]
 
 
+@pytest.mark.parametrize("free", [True, False])
+def test_an_object_on_the_floor_leaves_it_only_if_it_may(free):
+    decoder = LayoutDecoder(8, 4, floor_gradient=free)
+    features = torch.randn(1, 2, 8, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        decoder.mlp2.rows()[-6][1].fill_(-1.0)
+    start = float(decoder(features)[0].centers_m[..., 1].detach().mean())
+    optimizer = torch.optim.Adam(decoder.parameters(), lr=1e-2)
+    for _ in range(200):
+        layout, _ = decoder(features)
+        bottom = layout.centers_m[..., 1] - layout.sizes_m[..., 1] / 2
+        optimizer.zero_grad()
+        (bottom - 2).abs().mean().backward()
+        optimizer.step()
+    assert (float(bottom.detach().mean()) > 1.5) == free and start > 0
+
+
 def test_a_sure_class_has_its_own_chamfers_and_an_unsure_one_the_mean():
     table = ClassBevels(3)
     with torch.no_grad():

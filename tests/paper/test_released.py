@@ -78,6 +78,26 @@ def test_a_step_is_torchs_encoder_and_decoder_layer_their_norms_and_the_steps_ml
         assert (answer - wanted).abs().max() > 0.1
 
 
+def test_unrolling_feeds_each_steps_output_back_and_order_still_does_not_matter(torch_rng):
+    model = released_decoder()
+    z = points(torch_rng)
+    unrolled = model(z, 7)
+    features = z.new_zeros(3, 0, 24)
+    for _ in range(7):
+        newest = next_object(model, z, features)
+        features = torch.cat([features, newest.unsqueeze(1)], dim=1)
+    assert_close(unrolled, features, rtol=0, atol=1e-11)
+    shuffled = next_object(model, z, features[:, [3, 0, 5, 1, 4, 2]])
+    assert_close(shuffled, unrolled[:, 6], rtol=0, atol=1e-11)
+
+
+def test_every_weight_of_the_released_decoder_has_a_gradient():
+    model = released_decoder(width=12, steps=3)
+    z = F.normalize(torch.randn(2, 12, dtype=torch.float64), dim=-1)
+    model(z, 3).pow(3).sum().backward()
+    assert [n for n, p in model.named_parameters() if p.grad is None or not p.grad.any()] == []
+
+
 def test_separate_heads_give_each_coordinate_an_mlp(torch_rng):
     model = shaken(SeparateHeads(8, 4))
     shared = torch.randn(2, 3, 8, generator=torch_rng, dtype=torch.float64)

@@ -42,6 +42,32 @@ def test_the_next_object_does_not_depend_on_the_order_of_those_before(torch_rng,
     assert (next_object(model, z, previous.flip(0)) - wanted).abs().max() > 1e-3
 
 
+@pytest.mark.parametrize("dtype", TOLERANCE)
+def test_unrolling_with_a_cache_is_asking_step_by_step(torch_rng, dtype):
+    model = decoder(dtype).eval()
+    z, _ = inputs(torch_rng, dtype)
+    unrolled = model(z, 7)
+    features = z.new_zeros(3, 0, 24)
+    for _ in range(7):
+        newest = next_object(model, z, features)
+        features = torch.cat([features, newest.unsqueeze(1)], dim=1)
+    assert unrolled.shape == (3, 7, 24)
+    # An error of one step goes through all the later ones.
+    assert_close(unrolled, features, rtol=0, atol=10 * TOLERANCE[dtype])
+    assert_close(model(z, 3), unrolled[:, :3], rtol=0, atol=10 * TOLERANCE[dtype])
+
+
+def test_objects_that_no_room_needs_are_left_out(torch_rng):
+    model = decoder(torch.float64).eval()
+    z, _ = inputs(torch_rng, rooms=4)
+    needed = torch.tensor([2, 6, 0, 3])
+    found, whole = model(z, 6, needed), model(z, 6)
+    taken = torch.arange(6) < needed[:, None]
+    assert_close(found[taken], whole[taken], rtol=0, atol=1e-12)
+    assert not found[~taken].any()
+    assert not model(z, 6, torch.zeros(4, dtype=torch.int64)).any()
+
+
 def test_the_slow_twin_says_the_same(torch_rng):
     model = decoder().eval()
     z, previous = inputs(torch_rng, objects=4)

@@ -12,6 +12,8 @@ from tiny_runs import tiny_config, write_tiny_config
 from torch.testing import assert_close
 from toy_rooms import write_toy_shards
 
+from sceneprior.training.checkpoints import read_checkpoint
+
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[2]
@@ -60,6 +62,21 @@ def test_gradients_and_latents_agree_with_one_process(runs):
         assert moved > 1e-3 and alone["gradient/latents.weight"].abs().max() > 1e-4
     # What the first process calls its loss is its own share of the objects'.
     assert abs(one[0]["loss"] - two[0]["loss"]) > 1e-3
+
+
+def test_both_write_the_same_files_and_end_at_the_same_latents(runs):
+    folder, _, _ = runs
+    for stage in ("layout", "shape"):
+        files = [
+            sorted(p.name for p in (folder / run / stage).rglob("*") if p.is_file())
+            for run in ("one", "two")
+        ]
+        assert files[0] == files[1] and {"final.ckpt", "metrics.csv"} <= set(files[0])
+        one, two = (
+            read_checkpoint(folder / run / stage / "final.ckpt")["state_dict"]["latents.weight"]
+            for run in ("one", "two")
+        )
+        assert_close(two, one, rtol=0, atol=1e-6)
 
 
 def test_a_loss_that_is_no_number_in_one_process_stops_both(runs):

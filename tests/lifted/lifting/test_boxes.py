@@ -39,6 +39,19 @@ def test_boxes_are_those_of_the_room(rooms):
     assert np.concatenate(found).mean() > 0.6
 
 
+def test_room_and_cameras_move_together(rooms):
+    """By a sum of powers of two, which float32 poses take without rounding much."""
+    views = rooms[1][0]
+    shift = np.array([4.0, 0.0, -2.0], np.float32)
+    poses = views.world_to_camera.copy()
+    poses[:, :3, 3] -= poses[:, :3, :3] @ shift
+    moved = lift_boxes(replace(views, world_to_camera=poses))
+    still = lift_boxes(views)
+    # A pixel on the border of a cell may fall to its other side: a cell is some 4 cm.
+    np.testing.assert_allclose(moved.centers_m - shift, still.centers_m, rtol=0, atol=0.06)
+    np.testing.assert_allclose(moved.sizes_m, still.sizes_m, rtol=0, atol=0.12)
+
+
 def test_what_few_views_show_has_a_defined_box(rooms):
     views, _ = rooms[0]
     nowhere = views.visible.copy()
