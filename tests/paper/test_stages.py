@@ -1,6 +1,9 @@
 """The optimiser of the paper's stages: which rate trains what, and when it falls."""
 
+import pytest
+import torch
 from tiny_runs import tiny_config
+from torch.utils.data import Dataset, TensorDataset
 
 from sceneprior.paper.stages import LayoutStage, ShapeStage
 
@@ -10,8 +13,9 @@ def test_adam_has_a_rate_for_each_part_and_all_fall_tenfold_at_the_milestone(tmp
     rates["schedule"] = {"name": "steps", "milestones": [3], "decay": 0.1}
     config = tiny_config(tmp_path, **{f"layout__{key}": value for key, value in rates.items()})
     prior, latents = config.build_prior(), config.build_latents(2)
+    rooms: Dataset = TensorDataset(torch.zeros(2))
     terms = (config.loss, config.model.completeness_target, 0)
-    stage = LayoutStage(prior, latents, [], config.layout, *terms)
+    stage = LayoutStage(prior, latents, rooms, config.layout, *terms)
     of = stage.configure_optimizers()
     groups, schedule = of["optimizer"].param_groups, of["lr_scheduler"]
     seen = []
@@ -21,11 +25,11 @@ def test_adam_has_a_rate_for_each_part_and_all_fall_tenfold_at_the_milestone(tmp
         schedule.step()
     first = [1e-4, config.layout.shape_rate, 3e-4]
     assert seen[:3] == [first] * 3
-    assert seen[3] == [rate * 0.1 for rate in first]
+    assert seen[3] == pytest.approx([rate / 10 for rate in first], rel=1e-12)
     trained = {id(p) for group in groups for p in group["params"] if p.requires_grad}
     shape = {id(p) for p in prior.shape.parameters()}
     assert id(latents.weight) in {id(p) for p in groups[2]["params"]}
     assert not trained & shape, "layouts are trained without decoding shapes"
-    assert trained | shape >= {id(p) for p in (*prior.transformer.parameters(), latents.weight)}
-    ShapeStage(prior, latents, [], config.shape, *terms)
+    assert trained | shape >= {id(p) for p in (*prior.decoder.parameters(), latents.weight)}
+    ShapeStage(prior, latents, rooms, config.shape, *terms)
     assert all(p.requires_grad for p in prior.shape.parameters())
