@@ -173,14 +173,14 @@ def test_a_loss_that_is_no_number_names_its_rooms(toy_shards, tmp_path, monkeypa
     step, mask_loss, poisoned = LayoutStage.training_step, stages.mask_loss, []
 
     def of_layouts(self, views, batch_idx):
-        poisoned.append("latent")
+        poisoned.append(views.room_ids)
         with torch.no_grad():
             self.latents.weight[int(views.room_index[0])] = torch.nan
         return step(self, views, batch_idx)
 
-    def of_masks(*args, **settings):
-        poisoned.append("mask")
-        loss, overlap = mask_loss(*args, **settings)
+    def of_masks(masks, views, *args, **settings):
+        poisoned.append(views.room_ids)
+        loss, overlap = mask_loss(masks, views, *args, **settings)
         return loss * torch.nan, overlap
 
     if stage == "layout":
@@ -194,7 +194,7 @@ def test_a_loss_that_is_no_number_names_its_rooms(toy_shards, tmp_path, monkeypa
     # Those of the batch.
     assert message.count("toy/train_") == {"layout": 5, "shape": 6}[stage]
     assert "lower the learning rate" in message
-    assert len(poisoned) == 1
+    assert len(poisoned) == 1 and all(room in message for room in poisoned[0])
     # After an error, nothing is saved.
     assert not list((tmp_path / "run" / stage).rglob("*.ckpt"))
 
