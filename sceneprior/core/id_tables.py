@@ -225,5 +225,5 @@ def _open(path: Path, rgb: bool) -> Image.Image:
         return Image.open(path, formats=("PNG",))
     except FileNotFoundError:
         raise InputError(f"{path} is missing.") from None
-    except (OSError, SyntaxError, Image.DecompressionBombError) as error:
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(f"{path} is not a readable PNG ({str(error)[:120]}).") from None
