@@ -223,6 +223,8 @@ def _open(path: Path, rgb: bool) -> Image.Image:
         if not known:
             raise InputError(f"{path} is {kind[0]}-bit {kind[1]}; expected {wanted}.")
         return Image.open(path, formats=("PNG",))
+    except InputError:
+        raise
     except FileNotFoundError:
         raise InputError(f"{path} is missing.") from None
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
