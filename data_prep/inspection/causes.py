@@ -53,7 +53,7 @@ class Row(NamedTuple):
     corrected: str = "corrected"
     """Name of the correction, with {} for the detail."""
     with_truth: bool = True
-    """Whether the correction is also scored with the 3D ground truth."""
+    """True if the correction is also scored with the 3D ground truth."""
 
 
 def corrections(room: Room, convention: Convention) -> dict[Cause, Room]:

@@ -139,7 +139,7 @@ class Reader(ABC):
 
     @property
     def split_hint(self) -> str:
-        """What to check if no room is in `train`; "" if that cannot be."""
+        """Advice if no room is in `train`; "" if that cannot be."""
         return str(self.splits or "the split, or give one with --splits")
 
     def settings(self, only: str | None) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What commands say of the failures that a user can mend."""
+"""Sentences of commands on failures that a user can mend."""
 
 import errno
 

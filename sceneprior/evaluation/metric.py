@@ -253,7 +253,7 @@ class Metric:
     boxes: bool = False
     """True for metrics of pictures in which every object is drawn as its box (`--boxes`)."""
     needs: str = "a floor (floor_m) in the scenes"
-    """What a metric of use needs beside objects."""
+    """Parts of a room that a metric of use needs besides objects."""
     protocol: Mapping[str, Any] = field(default_factory=dict)
     """Entries of the metric in the protocol of a result file."""
     column: TableColumn | None = None

@@ -82,7 +82,7 @@ class Page:
         self._bounds_m = np.zeros((2, 3))
         """Lowest and highest corner of the room when it was framed."""
         self._eyes: dict[int, np.ndarray] = {}
-        """Where the page has put each browser's camera."""
+        """The place to which the page has moved each browser's camera."""
         server.scene.set_up_direction("+y")
         server.initial_camera.fov = FOV_RAD
         self.show(self.shown)

@@ -258,7 +258,7 @@ class RequestFields:
         self.rest_text = gui.add_html(rest, visible=bool(self._rest))
 
     def text(self, key: str) -> str:
-        """What is written in a field, without commas after the last door."""
+        """The text of a field, without commas after the last door."""
         text = str(self.fields[key].value).strip()
         return text.strip(",") if key == "openings" else text
 

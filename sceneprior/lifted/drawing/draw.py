@@ -32,7 +32,7 @@ BATCH = 512
 
 
 class Effort(NamedTuple):
-    """How hard rooms are tried."""
+    """Numbers of particles and attempts at rooms."""
 
     particles: int
     """Particles of a room. With more, an attempt meets rarer wishes, in proportionally more

@@ -1,4 +1,4 @@
-"""What depends on parts and outlines alone: outlines of furniture seen from above, and the terms of
+"""Functions of parts and outlines alone: outlines of furniture seen from above, and the terms of
 the loss on rays for volume, planes that contain faces, connected pieces, the gap to the floor or
 the ceiling, and overhang (an object that has one tips over).
 
