@@ -1,4 +1,4 @@
-"""What pictures and files show of a scene: colours, meshes and names of its objects.
+"""Appearance of a scene in pictures and files: colours, meshes and names of its objects.
 
 Metrics and pictures of masks use `classes.class_colors`, which differ as clearly as possible.
 """

@@ -1,4 +1,4 @@
-"""What the training steps of all methods share: the order of batches, weighted sum, checks, seeds,
+"""Shared parts of the training steps of all methods: order of batches, weighted sum, checks, seeds,
 precision, schedule."""
 
 import math

@@ -1,4 +1,4 @@
-"""What the baselines refuse: their settings, their data, and tasks that they cannot do."""
+"""Refusals of the baselines: their settings, their data, and tasks that they cannot do."""
 
 import shutil
 

@@ -1,4 +1,4 @@
-"""What core refuses: damaged files and impossible requests, each in one whole sentence."""
+"""Refusals of core: damaged files and impossible requests, each in one whole sentence."""
 
 import json
 from collections.abc import Callable

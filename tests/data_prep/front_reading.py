@@ -40,7 +40,7 @@ def extent(piece: Furniture) -> tuple[np.ndarray, np.ndarray]:
 
 
 def described(result: HouseRooms) -> dict[str, Any]:
-    """What was read, in numbers and words: for a golden file."""
+    """Contents that were read, in numbers and words: for a golden file."""
     rooms = {
         room.room_id: {
             "type": room.type,

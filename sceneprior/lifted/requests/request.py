@@ -237,7 +237,7 @@ class RequestFile(RoomRequest):
 
 @dataclass(frozen=True)
 class Conditions:
-    """What the rooms of a request must meet, as a prior understands it."""
+    """Conditions that the rooms of a request must meet, as a prior understands them."""
 
     classes: tuple[str, ...]
     """Names of the prior's classes, `void` included."""

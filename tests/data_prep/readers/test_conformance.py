@@ -25,7 +25,7 @@ TOLERANCE = {"boxes": 0.02, "mask_pixels": 4.0}
 
 
 def small(name: str, array: np.ndarray) -> np.ndarray:
-    """What the golden file keeps: every second pixel of images, the ends of long tables."""
+    """Parts that the golden file keeps: every second pixel of images, the ends of long tables."""
     if name in IMAGES:
         return array[:, ::2, ::2].astype(np.uint8)
     return np.concatenate([array[:5], array[-5:]]) if array.ndim and len(array) > 60 else array

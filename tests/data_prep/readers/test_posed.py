@@ -81,7 +81,7 @@ def test_pieces_on_the_floor_find_it_whatever_hangs_or_lies_on_them(room, lift):
 
 
 def test_the_file_says_units_and_its_world_is_mapped_exactly(room):
-    """What a file says of its units wins; axes are exchanged without an error of last bits."""
+    """Units stated in a file win; axes are exchanged without an error of last bits."""
     one, other = (
         prepared(room.write(**KEYS, metres_per_unit=1.0), metres_per_unit=unit)
         for unit in (1.0, 9.0)
