@@ -21,6 +21,7 @@ import scipy.stats  # noqa: F401
 import sklearn.linear_model  # noqa: F401
 import torch
 from browser import browser  # noqa: F401 (a fixture)
+from golden_values import TAKE_RUNS
 from kept_runs import LIFTED, add_lifted, take_lifted, write_kept_run
 from threadpoolctl import threadpool_limits
 from tiny_runs import tiny_config, tiny_lifted, tiny_sampler_config
@@ -139,7 +140,7 @@ def sampler_run(toy_shards: Path, made_once: Callable[..., Path]) -> Path:
 
     def make(run: Path) -> None:
         write_kept_run("sampler", tiny_sampler_config(toy_shards), run)
-        if os.environ.get("TAKE_RUNS"):
+        if TAKE_RUNS:
             take_lifted(toy_shards)
 
     return made_once("sampled", make)

@@ -1,19 +1,19 @@
 """Runs of toy rooms, trained once and kept in `golden/runs/`, so that tests do not train.
 
-`TAKE_RUNS=1 pytest tests` trains them anew and writes the files, after a change of what is
+`TAKE=runs pytest tests` trains them anew and writes the files, after a change of what is
 trained. A kept run has the weights that commands load, and no states of optimisers.
 """
 
 import hashlib
 import io
-import os
 import shutil
 import zipfile
 from pathlib import Path
 
 import torch
+from golden_values import FOLDER, TAKE_RUNS
 
-GOLDEN = Path(__file__).parent / "golden" / "runs"
+GOLDEN = FOLDER / "runs"
 TAKEN_ON = (2026, 1, 1, 0, 0, 0)
 """Date of all files in the archives, so that the same run gives the same archive."""
 LIFTED = GOLDEN / "lifted_toy_shards.zip"
@@ -33,7 +33,7 @@ def write_kept_run(name: str, config, run: Path) -> None:
     archive = GOLDEN / f"{name}.zip"
     plain = config.model_dump_json().replace(config.data.shards, "SHARDS")
     key = hashlib.sha256(plain.encode()).hexdigest()
-    if os.environ.get("TAKE_RUNS"):
+    if TAKE_RUNS:
         fit(config, run, trainer_options={"accelerator": "cpu"})
         files = {"key": key.encode()}
         for path in sorted(run.rglob("*")):
@@ -42,7 +42,7 @@ def write_kept_run(name: str, config, run: Path) -> None:
         _write(archive, files)
         return
     with zipfile.ZipFile(archive) as kept:
-        assert kept.read("key").decode() == key, f"{archive.name} is of another config: TAKE_RUNS=1"
+        assert kept.read("key").decode() == key, f"{archive.name} is of another config: TAKE=runs"
         kept.extractall(run)
     (run / "key").unlink()
     dump_settings(config, run / "config.yaml")

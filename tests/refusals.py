@@ -1,15 +1,16 @@
 """What users read when something is refused: every sentence, whole, in `golden/refusals/`.
 
 A test says only which input is refused; the sentence stands in one text file per area, where all
-of them can be read and compared. `TAKE_REFUSALS=1 pytest ...` writes those that changed.
+of them can be read and compared. `TAKE=1 pytest ...` writes those that changed.
 """
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-GOLDEN = Path(__file__).parent / "golden" / "refusals"
+from golden_values import FOLDER, TAKE
+
+GOLDEN = FOLDER / "refusals"
 
 
 @contextmanager
@@ -41,7 +42,7 @@ def refused(key: str, error: type[Exception] | None = None, **hidden: object) ->
     area, _, name = key.partition("/")
     path = GOLDEN / f"{area}.txt"
     known = _read(path)
-    if os.environ.get("TAKE_REFUSALS") and known.get(name) != line:
+    if TAKE and known.get(name) != line:
         known[name] = line
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("".join(f"{key}: {known[key]}\n" for key in sorted(known)))

@@ -1,14 +1,13 @@
 """Losses of a first batch and results of untrained networks, as they stand in a golden file.
 
-`TAKE_SCORES=1 pytest ...` writes `golden/baselines.csv`.
+`TAKE=1 pytest ...` writes `golden/baselines.csv`.
 """
 
 import csv
-import os
-from pathlib import Path
 
 import pytest
 import torch
+from golden_values import FOLDER, TAKE
 from pydantic import TypeAdapter
 from torch.nn import functional as F
 
@@ -17,14 +16,14 @@ from sceneprior.core.dataset import ViewDataset
 from sceneprior.core.views import RoomBoxes
 from sceneprior.training.fit import fit
 
-GOLDEN = Path(__file__).parents[1] / "golden" / "baselines.csv"
+GOLDEN = FOLDER / "baselines.csv"
 METHODS = ("gan", "atiss", "sync2gen", "set_flow", "usl", "total3d", "im3d")
 
 
 def compare(method: str, found: dict[str, float]) -> None:
     with GOLDEN.open(newline="") as file:
         known = {(of, name): float(value) for of, name, value in list(csv.reader(file))[1:]}
-    if os.environ.get("TAKE_SCORES"):
+    if TAKE:
         known = {key: value for key, value in known.items() if key[0] != method}
         known |= {(method, name): value for name, value in found.items()}
         with GOLDEN.open("w", newline="") as file:

@@ -1,19 +1,18 @@
 """All scores of four small rooms, as they stand in `golden/scores.csv`.
 
-`TAKE_SCORES=1 pytest ...` writes the file. A row is a metric of a set of rooms: its value, and the
+`TAKE=1 pytest ...` writes the file. A row is a metric of a set of rooms: its value, and the
 ends of its interval.
 """
 
 import csv
 import json
-import os
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import trimesh
+from golden_values import FOLDER, TAKE, assert_text
 
 from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.scene import Mesh, Opening, Scene, SceneObject, Turned
@@ -21,7 +20,6 @@ from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
 from sceneprior.evaluation.use import UseOptions, evaluate_use
 from sceneprior.evaluation.view_scores import ObjectPair, score_views
 
-GOLDEN = Path(__file__).parents[1] / "golden"
 LABELS = ("double_bed", "wardrobe", "desk", "nightstand", "chair", "ceiling_lamp", "shelf")
 SIZES_M = ((1.8, 0.6, 2.0), (1.5, 2.1, 0.6), (1.2, 0.75, 0.6), (0.5, 0.5, 0.4), (0.5, 0.9, 0.5),
            (0.4, 0.4, 0.4), (0.9, 0.4, 0.3))  # fmt: skip
@@ -142,8 +140,8 @@ def rows_of_views() -> dict[tuple[str, str], list[float | None]]:
 
 def test_every_score_is_the_frozen_one(scores):
     found = rows_of(scores) | rows_of_views()
-    path = GOLDEN / "scores.csv"
-    if os.environ.get("TAKE_SCORES"):
+    path = FOLDER / "scores.csv"
+    if TAKE:
         with path.open("w", newline="") as file:
             lines = csv.writer(file, lineterminator="\n")
             lines.writerow(("set", "metric", "value", "low", "high"))
@@ -168,7 +166,4 @@ def test_the_protocol_is_the_frozen_one(scores):
     protocol["renders_sha256"] = sorted(protocol["renders_sha256"])
     del protocol["networks"]["fid"]["sha256"], protocol["shards"]
     text = json.dumps(protocol | {"note": scores["note"]}, indent=1) + "\n"
-    path = GOLDEN / "scores_protocol.json"
-    if os.environ.get("TAKE_SCORES"):
-        path.write_text(text)
-    assert text == path.read_text()
+    assert_text("scores_protocol.json", text)

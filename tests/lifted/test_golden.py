@@ -1,16 +1,15 @@
 """What lifting, decoding, the losses and fitting give on toy rooms, against `golden/learning.json`.
 
-`TAKE_GOLDEN=1 pytest tests/lifted/test_golden.py` writes the file anew. Numbers have a tolerance,
+`TAKE=1 pytest tests/lifted/test_golden.py` writes the file anew. Numbers have a tolerance,
 since processors round differently.
 """
 
 import json
-import os
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from golden_values import FOLDER, TAKE
 from tiny_runs import tiny_config, tiny_lifted
 
 from sceneprior.core.observed_image import as_views
@@ -23,7 +22,7 @@ from sceneprior.paper.losses import mask_loss
 from sceneprior.paper.prior import TrainedPrior
 from sceneprior.paper.view_loss import match_and_score, proxy_boxes, seen_boxes, seen_masks
 
-GOLDEN = Path(__file__).parents[1] / "golden" / "learning.json"
+GOLDEN = FOLDER / "learning.json"
 
 
 def untrained(config):
@@ -64,7 +63,7 @@ def lifted(toy_shards, rooms):
 def check(name: str, **found) -> None:
     values = {key: np.asarray(value, dtype=np.float64).round(6) for key, value in found.items()}
     known = json.loads(GOLDEN.read_text()) if GOLDEN.exists() else {}
-    if os.environ.get("TAKE_GOLDEN"):
+    if TAKE:
         known[name] = {key: value.tolist() for key, value in values.items()}
         lines = (f"{json.dumps(key)}: {json.dumps(known[key])}" for key in sorted(known))
         GOLDEN.write_text("{\n" + ",\n".join(lines) + "\n}\n")

@@ -1,15 +1,14 @@
 """Help texts and refusals of all commands, whole, in `tests/golden/`; `TAKE=1 pytest ...` writes
 those that changed."""
 
-import os
 import re
 import shlex
 import socket
-from pathlib import Path
 
 import pytest
 import typer
 from cli_helpers import everything_in, one_sentence
+from golden_values import FOLDER, TAKE, assert_text
 from tiny_runs import write_tiny_config
 from typer.testing import CliRunner
 
@@ -17,8 +16,7 @@ from sceneprior.apps.cli.commands import app
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.render.scene_files import save
 
-GOLDEN = Path(__file__).parents[2] / "golden"
-HELP, REFUSED = GOLDEN / "help", GOLDEN / "refused_commands.txt"
+HELP, REFUSED = FOLDER / "help", FOLDER / "refused_commands.txt"
 COMMANDS = sorted(typer.main.get_command(app).commands)
 CALLS = re.findall(r"(?m)^\$ (.*)$", REFUSED.read_text())
 
@@ -31,9 +29,7 @@ def test_help_is_as_it_was(name, monkeypatch):
     done = CliRunner().invoke(app, [*words, "--help"], prog_name="sceneprior")
     text = re.sub(r"\x1b\[[0-9;]*m", "", done.output).strip()
     text = "\n".join(line.rstrip() for line in text.splitlines()) + "\n"
-    if os.environ.get("TAKE"):
-        (HELP / f"{name}.txt").write_text(text)
-    assert text == (HELP / f"{name}.txt").read_text()
+    assert_text(f"help/{name}.txt", text)
 
 
 def test_no_help_is_of_a_command_that_went():
@@ -71,7 +67,7 @@ def test_what_is_refused_is_one_sentence_and_writes_nothing(call, command, place
         said = said.replace(str(value), f"{{{name}}}")
     known = REFUSED.read_text()
     start = f"$ {call}\n"
-    if os.environ.get("TAKE"):
+    if TAKE:
         head, _, tail = known.partition(start)
         known = f"{head}{start}{said}\n{tail[tail.find('$ ') :] if '$ ' in tail else ''}"
         REFUSED.write_text(known)

@@ -7,7 +7,7 @@ import pytest
 from front_files import bedroom, room
 from front_jobs import digests, front_job, rooms_of, three_houses
 from front_reading import shared_front
-from golden import hold
+from golden_values import hold
 from refusals import refused
 from toy_source import ToySource
 

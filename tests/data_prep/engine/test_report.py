@@ -5,7 +5,7 @@ import json
 
 from front_files import bedroom, room
 from front_jobs import front_job, rooms_of
-from golden import hold
+from golden_values import hold
 from rich.console import Console
 
 from data_prep.engine.build import build_shards

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from front_files import bedroom
 from front_reading import only_room
-from golden import hold
+from golden_values import hold
 
 from data_prep.front.drawing import prepare_room
 from data_prep.front.recipe import load_recipe

@@ -4,7 +4,7 @@ import pytest
 from front_files import bedroom, room
 from front_jobs import front_job
 from front_reading import read
-from golden import hold
+from golden_values import hold
 
 from data_prep.engine.build import build_shards
 from data_prep.engine.report import report_tables

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from front_files import FrontFolder, bedroom, room, surface
 from front_reading import described, extent, only_room, read, shared_front
-from golden import hold
+from golden_values import hold
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from refusals import refused

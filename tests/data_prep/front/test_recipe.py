@@ -1,7 +1,7 @@
 """Recipes: what ships, how rules change, and what is no rule."""
 
 import pytest
-from golden import hold
+from golden_values import hold
 from refusals import refused
 
 from data_prep.front.recipe import load_recipe, recipe_text

@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from golden import hold
+from golden_values import hold
 from homes_on_disk import TYPES, read_rooms
 from refusals import refused
 from shapely.geometry import LineString, Point

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from front_jobs import bedroom_shards, rooms_of
-from golden import hold
+from golden_values import hold
 
 from data_prep.inspection.checks import array_problems, mask_problems, truth_problems
 

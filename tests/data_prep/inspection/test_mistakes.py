@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from captures import FLIP, Z_UP, changed, make_captures, of_ids, of_keys, of_poses, shards_of
-from golden import hold
+from golden_values import hold
 from mutations import scaled
 
 from data_prep.inspection.camera_convention import read_conventions

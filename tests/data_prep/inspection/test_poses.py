@@ -5,7 +5,7 @@ The whole sentences are in tests/golden/data_prep/verified.json.
 
 import numpy as np
 import pytest
-from golden import hold
+from golden_values import hold
 from mutations import KINDS, OPENGL, longer, mutated, scaled, swapped
 
 from data_prep.inspection.causes import GIVEN

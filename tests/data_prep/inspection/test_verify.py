@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 from front_jobs import change_room, six_bedrooms_shards
-from golden import hold
+from golden_values import hold
 from PIL import Image
 from posed_files import SET, PosedRoom
 from refusals import refused

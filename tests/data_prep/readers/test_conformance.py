@@ -1,13 +1,11 @@
 """One toy room in every format: each reader makes the same views of it, those of the golden file.
 
-`TAKE_READERS=1 pytest tests/data_prep/readers/test_conformance.py` writes the golden file anew.
+`TAKE=1 pytest tests/data_prep/readers/test_conformance.py` writes the golden file anew.
 """
-
-import os
-from pathlib import Path
 
 import numpy as np
 import pytest
+from golden_values import FOLDER, TAKE
 from toy_formats import FORMATS, arrays_of, read
 
 from data_prep.inspection.agreement import boxes_around, hull_of
@@ -16,7 +14,7 @@ from data_prep.readers.upright import own_sides
 from sceneprior.core.cameras import camera_centers
 from sceneprior.core.classes import label_set
 
-GOLDEN = Path(__file__).parents[2] / "golden" / "readers.npz"
+GOLDEN = FOLDER / "readers.npz"
 IMAGES = ("instance_ids", "stuff")
 PIXELS = 2e-3
 """Share of pixels that may differ: a triangle's edge through a pixel's centre, on another CPU."""
@@ -50,7 +48,7 @@ def made(tmp_path_factory):
     return of
 
 
-@pytest.mark.skipif("TAKE_READERS" not in os.environ, reason="writes the golden file")
+@pytest.mark.skipif(not TAKE, reason="writes the golden file")
 def test_take(made):
     kept = {
         f"{name}/{key}": small(key, array)

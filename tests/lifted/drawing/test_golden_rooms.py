@@ -1,22 +1,21 @@
 """Rooms drawn by the shipped priors, with and without a request, are those of the golden file.
 
-A change of what is drawn replaces the file: `TAKE_DRAWN=1 pytest tests/lifted/drawing`
+A change of what is drawn replaces the file: `TAKE=1 pytest tests/lifted/drawing`
 and says in its commit, with statistics, that new rooms are as good.
 """
 
-import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from golden_values import FOLDER, TAKE
 
 import sceneprior
 from sceneprior.core.classes import label_set
 from sceneprior.core.scene import Scene, SceneObject
 
-GOLDEN = Path(__file__).parents[2] / "golden" / "drawn_rooms.npz"
+GOLDEN = FOLDER / "drawn_rooms.npz"
 ROOMS = 20
 """Plain rooms of a prior, and requested rooms of all its requests together."""
 MAY_DIFFER = 2
@@ -78,7 +77,7 @@ def as_rows(rooms: Sequence[Scene]) -> np.ndarray:
 def test_drawn_rooms_are_the_golden_ones(name: str) -> None:
     found = {kind: as_rows(rooms) for kind, rooms in drawn(name).items()}
     known = dict(np.load(GOLDEN)) if GOLDEN.exists() else {}
-    if os.environ.get("TAKE_DRAWN"):
+    if TAKE:
         known |= {f"{name} {kind}": rows for kind, rows in found.items()}
         np.savez_compressed(GOLDEN, **known)
     for kind, rows in found.items():
