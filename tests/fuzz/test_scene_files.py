@@ -161,7 +161,7 @@ def fuzz_models(folder: Path) -> None:
     listed = damaged_json(record, rng) if rng.random() < 0.5 else json.dumps(record)
     (folder / "given" / "a" / "raw_model.obj").write_bytes(damaged_words(OBJ, rng))
     (folder / "given" / "model_info.json").write_text(listed)
-    open_models(folder / "given", "front3d_bedroom", folder / "cache", 16)
+    open_models(folder / "given", "front3d_bedroom", folder / "cache")
 
 
 @pytest.mark.slow

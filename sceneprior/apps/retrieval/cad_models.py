@@ -1,4 +1,10 @@
-"""CAD models by class, with points on their surfaces: of a folder's files, or the package's own.
+"""CAD models by class, with points on their surfaces: of a folder, or the package's own furniture.
+
+A folder has one of three layouts:
+
+<folder>/model_info.json, <model id>/raw_model.obj      3D-FUTURE
+<folder>/index.json, models/<model id>.ply              shards of `prep-front`
+<folder>/<class>/<any name>.glb or .obj                 the user's own models
 
 Points of files are sampled once per model and cached in one file; they are sampled again when the
 model's file changes. The package's own furniture (`sceneprior/furniture`) is built when an object
@@ -8,21 +14,34 @@ first needs its class, in 10 to 100 ms.
 import hashlib
 import io
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import warnings
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from sceneprior.apps.retrieval.model_folders import ModelFiles, find_models
-from sceneprior.core.classes import label_set
-from sceneprior.core.errors import InputError
-from sceneprior.core.files import file_stamp, write_whole
+from sceneprior.core.classes import LABEL_SETS, label_set
+from sceneprior.core.errors import InputError, InputWarning
+from sceneprior.core.files import file_stamp, is_name, write_whole
+from sceneprior.core.furniture import (
+    INFO_FILES,
+    MODEL_FILE,
+    category_table,
+    class_of_category,
+    model_categories,
+    read_obj,
+    tidy_category,
+)
+from sceneprior.core.ground_truth import model_path, read_model
 from sceneprior.core.scene import Mesh, Textured
+from sceneprior.core.shards import INDEX_NAME, iterate_rooms
 from sceneprior.core.surfaces import surface_points
-from sceneprior.furniture.catalog import Model, furniture_classes, make_variants
+from sceneprior.furniture.catalog import furniture_classes, make_variants
+from sceneprior.render.model_files import joined, load_parts
 
 POINTS = 1024
 """Points per surface; on a surface of 2 m2, one every 4 to 5 cm."""
@@ -49,9 +68,9 @@ class ClassModels:
 
 @dataclass(frozen=True)
 class CadModels:
-    """Models by class, and a function that loads their meshes."""
+    """Functions that give the models of a class, and load a model by its id."""
 
-    by_class: Mapping[str, ClassModels]
+    of_class: Callable[[str], ClassModels | None]
     load: Callable[[str], Mesh]
     """Loads the mesh of a model id, scaled to fill [-0.5, 0.5]^3."""
     textured: Callable[[str], tuple[Textured, ...]] = lambda model_id: ()
@@ -60,92 +79,238 @@ class CadModels:
     """Ids of unusable models, each with the reason."""
 
 
-def default_cache() -> Path:
-    """The default cache folder: $XDG_CACHE_HOME/sceneprior, or ~/.cache/sceneprior."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sceneprior"
+@cache
+def _made_of(label: str) -> tuple[ClassModels, dict[str, Mesh]]:
+    """The package's own models of a class, and their meshes, which are unions of closed solids."""
+    points, meshes = [], {}
+    for row, model in enumerate(make_variants(SEED, label)):
+        mesh = Mesh(np.asarray(model.mesh.vertices), np.asarray(model.mesh.faces))
+        points.append(_unit_samples(mesh))
+        meshes[f"{label}_{row:02d}"] = unit_mesh(mesh)
+    return ClassModels(tuple(meshes), np.stack(points)), meshes
+
+
+def made_models() -> CadModels:
+    """The package's own models of all classes that have tables of parts.
+
+    A class has the models of `make_variants`, in its styles and in sizes of real furniture.
+    """
+    return CadModels(
+        lambda label: _made_of(label)[0] if label in furniture_classes() else None,
+        lambda model_id: _made_of(model_id.rpartition("_")[0])[1][model_id],
+    )
+
+
+# -- The models of a folder ------------------------------------------------------------------------
+
+
+class _ModelFiles(NamedTuple):
+    """Files of the models of a label set's classes."""
+
+    labels: Mapping[str, str]
+    """Class of every model by its id; `void` if the label set has no class for it."""
+    path_of: Callable[[str], Path]
+    read: Callable[[Path], Mesh]
+    textured: Callable[[Path], tuple[Textured, ...]] = lambda path: ()
+    """Reads the parts of a model with their materials; none for models in class colours."""
 
 
 def open_models(
-    folder: Path,
-    label_set_name: str,
-    cache: Path | None = None,
-    points: int = POINTS,
-    track: Track = iter,
+    folder: Path, label_set_name: str, cache: Path | None = None, track: Track = iter
 ) -> CadModels:
     """Open the models of a label set's classes, with points on their surfaces.
 
     Args:
         folder: The models of 3D-FUTURE, shards of `prep-front` with this label set, or GLBs and
-            OBJs in sub-folders by class; see `model_folders.py`.
-        cache: Folder for the cache file of points, by default `default_cache()`.
+            OBJs in sub-folders by class.
+        cache: Folder for the cache file of points, by default $XDG_CACHE_HOME/sceneprior or
+            ~/.cache/sceneprior.
+
+    Raises:
+        InputError: the folder is missing, has none of the layouts, or no usable model.
     """
     folder = Path(folder)
-    found = find_models(folder, label_set_name)
-    files, labels = found.paths, found.labels
-    drawn, unread = _points_of_models(folder, found, cache or default_cache(), points, track)
-    broken = {**found.broken, **unread}
+    files = _find_models(folder, label_set_name)
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    points, broken = _points_of_models(folder, files, cache or home / "sceneprior", track)
     by_class = {}
     for label in label_set(label_set_name):
-        if of_class := [m for m in files if labels[m] == label and m not in broken]:
-            stack = np.stack([drawn[m] for m in of_class])
-            by_class[label] = ClassModels(tuple(of_class), stack)
+        if ids := tuple(m for m in points if files.labels[m] == label):
+            by_class[label] = ClassModels(ids, np.stack([points[m] for m in ids]))
     if not by_class:
         raise InputError(
-            f"{folder} holds no usable model of a class of {label_set_name} ({len(labels)} models "
-            f"listed, {len(broken)} of them broken); give --models a folder with model files."
+            f"{folder} holds no usable model of a class of {label_set_name} ({len(files.labels)} "
+            f"models listed, {len(broken)} of them broken); give --models a folder with model "
+            "files."
         )
 
     def load(model_id: str) -> Mesh:
-        return unit_mesh(found.read(files[model_id]))
+        return unit_mesh(files.read(files.path_of(model_id)))
 
     def textured(model_id: str) -> tuple[Textured, ...]:
-        whole = np.asarray(found.read(files[model_id]).vertices_m, dtype=np.float64)
+        path = files.path_of(model_id)
+        whole = np.asarray(files.read(path).vertices_m, dtype=np.float64)
         return tuple(
-            part._replace(mesh=Mesh(unit_points(part.mesh.vertices_m, whole), part.mesh.faces))
-            for part in found.textured(files[model_id])
+            part._replace(mesh=Mesh(_unit_points(part.mesh.vertices_m, whole), part.mesh.faces))
+            for part in files.textured(path)
         )
 
-    return CadModels(
-        by_class, lru_cache(_MESHES_KEPT)(load), lru_cache(_TEXTURED_KEPT)(textured), broken
+    kept = lru_cache(_MESHES_KEPT)(load), lru_cache(_TEXTURED_KEPT)(textured)
+    return CadModels(by_class.get, *kept, broken)
+
+
+def _find_models(folder: Path, label_set_name: str) -> _ModelFiles:
+    """The models of a folder in any of the three layouts."""
+    if (folder / INDEX_NAME).is_file():
+        labels = _labels_of_shards(folder, label_set_name)
+        return _ModelFiles(labels, lambda model_id: model_path(folder, model_id), read_model)
+    if folder.is_dir() and not any((folder / name).is_file() for name in INFO_FILES):
+        return _own_models(folder, label_set_name)
+    categories = model_categories(folder, "--models")
+    labels = {m: class_of_category(name, label_set_name) for m, name in categories.items()}
+    return _ModelFiles(labels, lambda m: folder / m / MODEL_FILE, read_obj, read_textured)
+
+
+def _labels_of_shards(folder: Path, label_set_name: str) -> dict[str, str]:
+    """Classes of the models in training rooms, as assigned by the recipe of the shards."""
+    labels: dict[str, str] = {}
+    for shard, room_id in iterate_rooms(folder, "train"):
+        if shard.label_set != label_set_name:
+            raise InputError(
+                f"The rooms of {folder} have label set '{shard.label_set}', but the scenes have "
+                f"'{label_set_name}'; give --models shards with the scenes' label set."
+            )
+        truth = shard.read_ground_truth(room_id)
+        names = label_set(label_set_name)
+        labels |= {
+            model_id: names[label]
+            for model_id, label in zip(truth.model_ids, truth.object_class, strict=True)
+            if model_id  # ScanNet's objects have none
+        }
+    return labels
+
+
+def _own_models(folder: Path, label_set_name: str) -> _ModelFiles:
+    """Models in sub-folders by class; a folder with an unknown class name gives a warning."""
+    labels = {}
+    for home in sorted(path for path in folder.iterdir() if path.is_dir()):
+        files = sorted(path for path in home.iterdir() if path.suffix.lower() in (".glb", ".obj"))
+        label = class_of_folder(home.name, label_set_name)
+        if files and label is None:
+            warnings.warn(
+                f"{home} is left out, with {len(files)} models: its name is neither a class of "
+                f"{label_set_name} nor a category of 3D-FUTURE; name it after its class, such as "
+                f"{label_set(label_set_name)[1]}.",
+                InputWarning,
+                stacklevel=2,
+            )
+        labels |= {f"{home.name}/{path.name}": label or "void" for path in files}
+    if not labels:
+        raise InputError(
+            f"{folder} has no model_info.json (a folder of 3D-FUTURE), no {INDEX_NAME} (shards), "
+            "nor a sub-folder of a class with GLBs or OBJs; --models names one of them."
+        )
+
+    def read(path: Path) -> Mesh:
+        return read_glb(path) if path.suffix.lower() == ".glb" else read_obj(path)
+
+    return _ModelFiles(labels, lambda model_id: folder / model_id, read, read_textured)
+
+
+def class_of_folder(name: str, label_set_name: str) -> str | None:
+    """Class of the models in a folder, from the folder's name, which is a class of the label set or
+    a 3D-FUTURE category. Upper case and underscores for spaces are allowed.
+
+    `void` for a known class or category that the label set lacks; None for an unknown name.
+
+        >>> class_of_folder("Double_Bed", "front3d_bedroom"), class_of_folder("king-size bed",
+        ...     "front3d_bedroom")
+        ('double_bed', 'double_bed')
+        >>> class_of_folder("bathtub", "front3d_bedroom"), class_of_folder("unicorn", "scannet")
+        ('void', None)
+    """
+    plain = _plain(name)
+    if (label := {_plain(each): each for each in label_set(label_set_name)}.get(plain)) is not None:
+        return label
+    categories = {_plain(each): each for each in category_table()}
+    if plain in categories:
+        return class_of_category(categories[plain], label_set_name)
+    return (
+        "void" if plain in {_plain(each) for some in LABEL_SETS.values() for each in some} else None
     )
 
 
-def unit_mesh(mesh: Mesh) -> Mesh:
-    """Move and scale a mesh to fill [-0.5, 0.5]^3; a flat side becomes 0."""
-    vertices = np.asarray(mesh.vertices_m, dtype=np.float64)
-    return Mesh(unit_points(vertices, vertices), mesh.faces)
+def _plain(name: str) -> str:
+    # A folder's name has no slash: "bookcase_jewelry armoire" is "bookcase / jewelry armoire".
+    return tidy_category(name).replace("_", " ").replace("/", " ")
 
 
-def unit_points(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
-    """Points of a mesh, moved and scaled with it; see `unit_mesh`."""
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    sides = high - low
-    scale = np.where(sides > _FLAT * sides.max(), 1 / np.maximum(sides, 1e-300), 0.0)
-    return (points - (low + high) / 2) * scale
+def read_glb(path: Path) -> Mesh:
+    """All meshes of a GLB as one, placed by its nodes.
+
+    Raises:
+        InputError: the file is damaged, or holds no triangles.
+    """
+    where = f"{path.parent.name}/{path.name}"
+    try:
+        parts = list(load_parts(path, "glb", with_materials=False).values())
+    except Exception as error:  # a damaged file raises almost anything in trimesh
+        reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+        raise InputError(f"{where} cannot be read ({reason.rstrip('.')})") from None
+    if not parts:
+        raise InputError(f"{where} holds no usable triangles")
+    return joined(parts)
+
+
+def read_textured(path: Path) -> tuple[Textured, ...]:
+    """The parts of a GLB or an OBJ with their materials; none if no part has one.
+
+    Materials that cannot be read, such as those with a damaged image, are a warning.
+    """
+    try:
+        parts = tuple(load_parts(path, path.suffix[1:].lower()).values())
+    except Exception as error:  # a damaged file raises almost anything in trimesh
+        warnings.warn(
+            f"{path.parent.name}/{path.name} gets the colour of its class, because its materials "
+            f"cannot be read ({type(error).__name__}: {error}).",
+            InputWarning,
+            stacklevel=2,
+        )
+        return ()
+    return parts if any(part.material is not None for part in parts) else ()
+
+
+# -- Points on surfaces ----------------------------------------------------------------------------
 
 
 def _points_of_models(
-    folder: Path, found: ModelFiles, cached: Path, count: int, track: Track
+    folder: Path, files: _ModelFiles, cached: Path, track: Track
 ) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Sample `count` points of each model; returns them, and the reasons for broken models.
+    """Sample points of each model; returns them, and the reasons for broken models.
 
     The points are cached in an npz in the folder `cached`, even if sampling is interrupted.
     """
-    settings = f"{folder.resolve()}|{count}|{SEED}|{FORMAT}"
+    settings = f"{folder.resolve()}|{POINTS}|{SEED}|{FORMAT}"
     kept = cached / f"points-{hashlib.sha256(settings.encode()).hexdigest()[:16]}.npz"
-    before = _read_points(kept)
+    before = dict[str, np.ndarray]()
+    try:
+        with np.load(kept, allow_pickle=False) as file:
+            before = dict(zip(file["keys"].tolist(), file["points"], strict=True))
+    except Exception:  # absent or damaged: points are sampled again
+        pass
     keys, broken = dict[str, str](), dict[str, str]()
-    for model_id, path in found.paths.items():
+    for model_id in sorted(m for m, label in files.labels.items() if label != "void"):
         try:
-            keys[model_id] = f"{model_id} {file_stamp(path)}"
+            if not all(map(is_name, model_id.split("/"))):
+                raise InputError(f"{ascii(model_id)[:60]} cannot be a folder's name")
+            keys[model_id] = f"{model_id} {file_stamp(files.path_of(model_id))}"
         except InputError as error:
             broken[model_id] = str(error)
     points = {key: before[key] for key in keys.values() if key in before}
     try:
         for model_id in track([m for m, key in keys.items() if key not in points]):
             try:
-                mesh = found.read(found.paths[model_id])
-                points[keys[model_id]] = _unit_samples(mesh.vertices_m, mesh.faces, count)
+                points[keys[model_id]] = _unit_samples(files.read(files.path_of(model_id)))
             except (InputError, ValueError) as error:
                 broken[model_id] = str(error)
     finally:
@@ -156,71 +321,25 @@ def _points_of_models(
     return {m: points[key] for m, key in keys.items() if key in points}, broken
 
 
-def _read_points(path: Path) -> dict[str, np.ndarray]:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return dict(zip(file["keys"].tolist(), file["points"], strict=True))
-    except Exception:  # absent or damaged: points are sampled again
-        return {}
-
-
-def _unit_samples(
-    vertices: np.ndarray, faces: np.ndarray, count: int
-) -> Float[np.ndarray, "{count} 3"]:
+def _unit_samples(mesh: Mesh) -> Float[np.ndarray, "points 3"]:
     """Points on a surface, moved and scaled with it to the unit box.
 
     They are sampled before scaling, which would enlarge thin sides.
     """
-    vertices = np.asarray(vertices, dtype=np.float64)
-    points = surface_points(vertices, faces, count, SEED)
-    return unit_points(points, vertices).astype(np.float32)
+    vertices = np.asarray(mesh.vertices_m, dtype=np.float64)
+    points = surface_points(vertices, mesh.faces, POINTS, SEED)
+    return _unit_points(points, vertices).astype(np.float32)
 
 
-# -- The package's own models ----------------------------------------------------------------------
+def unit_mesh(mesh: Mesh) -> Mesh:
+    """Move and scale a mesh to fill [-0.5, 0.5]^3; a flat side becomes 0."""
+    vertices = np.asarray(mesh.vertices_m, dtype=np.float64)
+    return Mesh(_unit_points(vertices, vertices), mesh.faces)
 
 
-@cache
-def made_models() -> CadModels:
-    """The package's own models of all classes that have tables of parts.
-
-    A class has the models of `make_variants`, in its styles and in sizes of real furniture. Their
-    meshes are unions of closed solids.
-    """
-    return CadModels(_Made(), _load)
-
-
-class _Made(Mapping[str, ClassModels]):
-    """Models by class, each class built when it is first read."""
-
-    def __getitem__(self, label: str) -> ClassModels:
-        if label not in furniture_classes():
-            raise KeyError(label)
-        return _made_of(label)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(furniture_classes())
-
-    def __len__(self) -> int:
-        return len(furniture_classes())
-
-
-@cache
-def _made_of(label: str) -> ClassModels:
-    points = [_unit_samples(*_arrays(model), POINTS) for model in _variants(label)]
-    ids = tuple(f"{label}_{row:02d}" for row in range(len(points)))
-    return ClassModels(ids, np.stack(points))
-
-
-@cache
-def _load(model_id: str) -> Mesh:
-    label, _, row = model_id.rpartition("_")
-    return unit_mesh(Mesh(*_arrays(_variants(label)[int(row)])))
-
-
-@cache
-def _variants(label: str) -> list[Model]:
-    return make_variants(SEED, label)
-
-
-def _arrays(model: Model) -> tuple[np.ndarray, np.ndarray]:
-    return np.asarray(model.mesh.vertices), np.asarray(model.mesh.faces)
+def _unit_points(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+    """Points of a mesh, moved and scaled with it; see `unit_mesh`."""
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    sides = high - low
+    scale = np.where(sides > _FLAT * sides.max(), 1 / np.maximum(sides, 1e-300), 0.0)
+    return (points - (low + high) / 2) * scale

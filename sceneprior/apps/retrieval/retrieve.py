@@ -32,7 +32,7 @@ ROUNDS = ((16, 1 / 3), (4, None))
 """(step, share) of each preselection: compare every `step`-th point, and keep this share of the
 candidates; None keeps `KEEP`."""
 KEEP = 16
-"""Candidates (model and turn) compared by all points; None compares all: exact, and slow."""
+"""Candidates (model and turn) compared by all points."""
 OTHER_TURN = 1.2
 """Factor on the distances of models whose turn differs from the object's known yaw. Without the
 factor, a cupboard facing backwards has only 1.0 to 1.1 times the distance of one facing forwards; a
@@ -68,7 +68,7 @@ def retrieve(scene: Scene, models: CadModels, keep: Collection[int] = ()) -> Sce
     found: list[dict[str, object] | None] = []
     for row, item in enumerate(scene.objects):
         box, told = item if row in keep else extruded(item), None
-        if row not in keep and (of_class := models.by_class.get(item.label)):
+        if row not in keep and (of_class := models.of_class(item.label)):
             best = most_similar(box, of_class)
             mesh = placed(models.load(best.model_id), box, best.turn_deg)
             textured = tuple(
@@ -115,7 +115,7 @@ def retrieval_report(scenes: Sequence[Scene], models: CadModels) -> dict[str, An
     for label in sorted({label for label, _ in pairs}):
         given = [found for name, found in pairs if name == label and found]
         distances = [found["distance_m"] for found in given]
-        there = models.by_class.get(label)
+        there = models.of_class(label)
         classes[label] = {
             "objects": sum(name == label for name, _ in pairs),
             "models": len(there.model_ids) if there else 0,
@@ -152,17 +152,21 @@ def placed(unit: Mesh, item: SceneObject, turn_deg: int) -> Mesh:
     return Mesh(turned * np.asarray(item.size_m) + np.asarray(item.center_m), unit.faces)
 
 
-def most_similar(item: SceneObject, models: ClassModels, keep: int | None = KEEP) -> Retrieved:
+def most_similar(item: SceneObject, models: ClassModels) -> Retrieved:
     """The model and turn of a class that are nearest to an object by Chamfer distance.
 
     If the object's yaw is known and a quarter turn, the distances of models at other turns are
     multiplied by `OTHER_TURN`.
     """
-    count = models.points.shape[1]
-    views = _turned_views(_points_of(item, count) - np.asarray(item.center_m), item.size_m)
+    # Turning the object back by each quarter turn, instead of turning the models, gives the same
+    # distances, and the models' points are used as stored.
+    at_center = _points_of(item, models.points.shape[1]) - np.asarray(item.center_m)
+    back = [quarter_rotation(quarters).T for quarters in range(QUARTERS)]
+    size_m = np.asarray(item.size_m, dtype=np.float64)
+    views = [(at_center @ turn.T, np.abs(turn @ size_m)) for turn in back]
     choices = np.arange(len(models.model_ids) * QUARTERS)
-    for step, share in ROUNDS if keep is not None else ():
-        going_on = max(keep or 0, int(len(choices) * share) if share else 0)
+    for step, share in ROUNDS:
+        going_on = max(KEEP, int(len(choices) * share) if share else 0)
         if going_on < len(choices):
             rough = _rough_distances(views, models.points, choices, step)
             # A stable sort keeps the first of equal models on every machine.
@@ -196,18 +200,6 @@ def _points_of(item: SceneObject, count: int) -> np.ndarray:
         except ValueError:  # no area: a collapsed mesh, or a box of size 0
             continue
     return np.tile(np.asarray(item.center_m, dtype=np.float64), (count, 1))
-
-
-def _turned_views(
-    points: Float[np.ndarray, "points 3"], size_m: Sequence[float]
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The object's points and box sizes, turned back by each quarter turn.
-
-    Turning the object back instead of turning the models gives the same distances, and the models'
-    points are used as stored.
-    """
-    back = [quarter_rotation(quarters).T for quarters in range(QUARTERS)]
-    return [(points @ turn.T, np.abs(turn @ np.asarray(size_m, dtype=np.float64))) for turn in back]
 
 
 def _rough_distances(

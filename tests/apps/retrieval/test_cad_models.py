@@ -6,9 +6,9 @@ import trimesh
 from model_folder import blocks, corner_sofa, write_model, write_models
 from refusals import refused
 
-from sceneprior.apps.retrieval import model_folders
-from sceneprior.apps.retrieval.cad_models import open_models
-from sceneprior.apps.retrieval.model_folders import class_of_folder, read_glb
+from sceneprior.apps.retrieval import cad_models
+from sceneprior.apps.retrieval.cad_models import POINTS, class_of_folder, open_models, read_glb
+from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputWarning
 
 BED = blocks(((0, 0.3, 0), (1.8, 0.6, 2.0)), ((0, 0.6, -0.95), (1.8, 1.2, 0.1)))
@@ -54,19 +54,20 @@ def own(tmp_path):
 def read(monkeypatch):
     """Names of the folders whose OBJ was read."""
     reads = []
-    read_obj = model_folders.read_obj
+    read_obj = cad_models.read_obj
     monkeypatch.setattr(
-        model_folders, "read_obj", lambda path: reads.append(path.parent.name) or read_obj(path)
+        cad_models, "read_obj", lambda path: reads.append(path.parent.name) or read_obj(path)
     )
     return reads
 
 
-def opened(folder, points=64, label_set="front3d_bedroom", **options):
-    return open_models(folder, label_set, folder.parent / "cache", points, **options)
+def opened(folder, label_set_name="front3d_bedroom", **options):
+    return open_models(folder, label_set_name, folder.parent / "cache", **options)
 
 
 def ids_of(models):
-    return {label: some.model_ids for label, some in models.by_class.items()}
+    found = {label: models.of_class(label) for label in label_set("front3d_bedroom")}
+    return {label: some.model_ids for label, some in found.items() if some}
 
 
 def test_models_by_class_and_broken_models(folder):
@@ -78,34 +79,29 @@ def test_models_by_class_and_broken_models(folder):
     assert "no usable triangles" in models.broken["nan"] and "no area" in models.broken["point"]
     assert "cannot be read" in models.broken["missing"]
     assert "cannot be a folder's name" in models.broken["../x"]
-    beds = models.by_class["double_bed"].points
-    assert beds.shape == (2, 64, 3) and np.abs(beds).max() <= 0.5
+    beds = models.of_class("double_bed").points
+    assert beds.shape == (2, POINTS, 3) and np.abs(beds).max() <= 0.5
     # A hundred times too large is the same model in its unit box.
     np.testing.assert_allclose(beds[0], beds[1], atol=1e-6)
-    assert (models.by_class["table"].points[..., 1] == 0).all()  # flat stays flat
+    assert (models.of_class("table").points[..., 1] == 0).all()  # flat stays flat
     np.testing.assert_allclose(np.ptp(models.load("huge").vertices_m, axis=0), 1)
 
 
 def test_points_are_sampled_once_and_again_where_a_file_changed(folder, read):
-    first = opened(folder).by_class["double_bed"].points
+    first = opened(folder).of_class("double_bed").points
     assert sorted(read) == ["bed", "faceless", "flat", "huge", "nan", "point"]
     read.clear()
-    np.testing.assert_array_equal(first, opened(folder).by_class["double_bed"].points)
+    np.testing.assert_array_equal(first, opened(folder).of_class("double_bed").points)
     assert sorted(read) == ["faceless", "nan", "point"]  # broken ones may have been mended
     read.clear()
     write_model(folder, "bed", corner_sofa())
-    beds = opened(folder).by_class["double_bed"].points
+    beds = opened(folder).of_class("double_bed").points
     assert "bed" in read and "huge" not in read
     assert np.abs(beds[0] - first[0]).max() > 0.05
     np.testing.assert_array_equal(beds[1], first[1])
-    read.clear()
-    assert opened(folder, points=32).by_class["table"].points.shape == (1, 32, 3)
-    assert "huge" in read  # other settings, another file
-    files = list((folder.parent / "cache").iterdir())
-    assert len(files) == 2
-    for path in files:
-        path.write_bytes(path.read_bytes()[:100])
-    np.testing.assert_array_equal(beds, opened(folder).by_class["double_bed"].points)
+    (path,) = (folder.parent / "cache").iterdir()
+    path.write_bytes(path.read_bytes()[:100])
+    np.testing.assert_array_equal(beds, opened(folder).of_class("double_bed").points)
 
 
 def test_points_sampled_before_an_interrupt_are_kept(folder, read):
@@ -162,11 +158,11 @@ def test_unknown_names_and_damaged_files_are_a_sentence_each(own):
 
 def test_folders_without_a_usable_model_are_sentences(folder, own, tmp_path):
     (tmp_path / "empty").mkdir()
-    for name, given, label_set in (
+    for name, given, labels in (
         ("missing", tmp_path / "none", "front3d_bedroom"),
         ("empty", tmp_path / "empty", "front3d_bedroom"),
         ("future", folder, "void,spaceship"),
         ("own", own, "void,spaceship"),
     ):
         with refused(f"apps/models_{name}", tmp=tmp_path):
-            opened(given, label_set=label_set)
+            opened(given, labels)

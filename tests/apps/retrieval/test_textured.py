@@ -10,8 +10,7 @@ import trimesh
 from gltf import images_of, json_of, validate
 from PIL import Image
 
-from sceneprior.apps.retrieval.cad_models import open_models
-from sceneprior.apps.retrieval.model_folders import read_textured
+from sceneprior.apps.retrieval.cad_models import open_models, read_textured
 from sceneprior.apps.retrieval.retrieve import retrieve
 from sceneprior.apps.rooms import write_scenes
 from sceneprior.core.boxes import quarter_rotation
@@ -70,7 +69,7 @@ def models(request, tmp_path):
             glb = trimesh.load_scene(path, process=False).export(file_type="glb")
             (folder / "sofa" / "own.glb").write_bytes(glb)
             path.unlink()
-    return open_models(folder, "front3d_bedroom", tmp_path / "cache", 64)
+    return open_models(folder, "front3d_bedroom", tmp_path / "cache")
 
 
 def retrieved(models) -> Scene:
