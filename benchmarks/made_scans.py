@@ -30,8 +30,8 @@ from data_prep.front.furnished import Room
 from data_prep.front.houses import house_files, read_house
 from data_prep.front.models import ModelBank
 from data_prep.front.recipe import Recipe, load_recipe
+from data_prep.readers.annotations import LIKE_NYU40, NYU40, Labels, read_labels
 from data_prep.readers.frames import Y_UP
-from data_prep.readers.labels import LIKE_NYU40, NYU40, Labels, read_labels
 from data_prep.readers.scanned_mesh import read_annotated_mesh
 from sceneprior.core.classes import STUFF, label_set
 

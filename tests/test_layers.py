@@ -56,7 +56,7 @@ BUDGET = {
 it bought and what went for it."""
 
 OWNERS = {
-    "h5py": ["sceneprior/core/shard", "data_prep/readers/files.py"],
+    "h5py": ["sceneprior/core/shard", "data_prep/readers/annotations.py"],
     "pyrender": ["sceneprior/render/offscreen/"],
     "OpenGL": ["sceneprior/render/offscreen/"],
     "numba": [

@@ -24,9 +24,9 @@ from pydantic import BaseModel, Field, TypeAdapter
 from data_prep.engine.plan import digest
 from data_prep.engine.source import RoomTask
 from data_prep.front.recipe import Recipe
-from data_prep.readers.files import by_number, read_hdf5, read_records
+from data_prep.readers.annotations import read_hdf5, read_records
 from data_prep.readers.frames import GL_TO_CV, chosen_frames, sampled
-from data_prep.readers.reader import FoundRoom, Reader
+from data_prep.readers.reader import FoundRoom, Reader, by_number
 from data_prep.readers.rooms import FramedRoom, numbered
 from sceneprior.core.checked import plain, shown
 from sceneprior.core.errors import InputError

@@ -22,9 +22,8 @@ import numpy as np
 from scipy.linalg import rq
 
 from data_prep.engine.source import RoomTask
-from data_prep.readers.files import read_hdf5, read_records
+from data_prep.readers.annotations import ids_and_classes, read_hdf5, read_records
 from data_prep.readers.frames import GL_TO_CV, Y_UP, chosen_frames, sampled
-from data_prep.readers.labels import ids_and_classes
 from data_prep.readers.reader import FoundRoom, Reader
 from data_prep.readers.rooms import FramedRoom, corners_of, numbered
 from sceneprior.core.checked import plain

@@ -1,7 +1,7 @@
 """The source of every data set and capture: it lists rooms, splits them, and prepares each."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -23,7 +23,7 @@ from data_prep.engine.source import (
     sentence_of,
 )
 from data_prep.engine.workers import Run
-from data_prep.readers.labels import LABEL_SET
+from data_prep.readers.annotations import LABEL_SET
 from data_prep.readers.rooms import FramedRoom, prepare_room
 from sceneprior.core.errors import InputError
 from sceneprior.render.offscreen import Renderer
@@ -188,3 +188,8 @@ def _look(reader: Reader, scene: str) -> dict[str, FoundRoom] | str:
         return reader.rooms(scene)
     except Exception as error:
         return sentence_of(error)
+
+
+def by_number(paths: Sequence[Path]) -> list[Path]:
+    """Sort paths that are named by numbers: 2 before 10."""
+    return sorted(paths, key=lambda path: (len(path.name), path.name))

@@ -17,8 +17,8 @@ import numpy as np
 
 from data_prep.engine.plan import digest, seeded_split
 from data_prep.engine.source import Line, RoomTask
+from data_prep.readers.annotations import LABEL_SET, Labels, read_labels
 from data_prep.readers.frames import Y_UP, chosen_frames, mask_intrinsics, sampled_lines
-from data_prep.readers.labels import LABEL_SET, Labels, read_labels
 from data_prep.readers.reader import FoundRoom, Reader
 from data_prep.readers.rooms import FramedRoom, ScannedObjects
 from data_prep.readers.scan_files import MASK_FILES, MaskArchive, read_alignment, read_sens

@@ -24,8 +24,8 @@ from pydantic import BaseModel, Field, RootModel
 
 from data_prep.engine.plan import digest
 from data_prep.engine.source import RoomTask
+from data_prep.readers.annotations import LABEL_SET, LIKE_NYU40, TABLE, Labels, read_labels
 from data_prep.readers.frames import GL_TO_CV, Y_UP, chosen_frames, shrunk
-from data_prep.readers.labels import LABEL_SET, LIKE_NYU40, TABLE, Labels, read_labels
 from data_prep.readers.posed.colmap import read_model
 from data_prep.readers.posed.recording import PosedFrame, PosedPicture, frame_intrinsics
 from data_prep.readers.posed.transforms import FILE_NAME, read_recording

@@ -22,10 +22,9 @@ import numpy as np
 from pydantic import BaseModel, RootModel
 
 from data_prep.engine.source import RoomTask
-from data_prep.readers.files import by_number
+from data_prep.readers.annotations import ids_and_classes
 from data_prep.readers.frames import Y_UP, chosen_frames, sampled
-from data_prep.readers.labels import ids_and_classes
-from data_prep.readers.reader import FoundRoom, Reader
+from data_prep.readers.reader import FoundRoom, Reader, by_number
 from data_prep.readers.rooms import FramedRoom, corners_of, numbered
 from sceneprior.core.cameras import odd_field_of_view
 from sceneprior.core.checked import checked, shown

@@ -29,7 +29,7 @@ from data_prep.engine.build import Job, build_shards
 from data_prep.front.furnished import Room
 from data_prep.front.recipe import load_recipe
 from data_prep.homes.make import make_homes
-from data_prep.readers.labels import Labels, read_labels
+from data_prep.readers.annotations import Labels, read_labels
 from data_prep.readers.scannet import ScanNet
 from sceneprior.core.classes import STUFF, label_set
 from sceneprior.core.shards import Shard, list_shards

@@ -15,7 +15,7 @@ from scan_files import BOX_FACES
 from scipy.spatial.transform import Rotation
 from trimesh import Trimesh
 
-from data_prep.readers.labels import NYU40
+from data_prep.readers.annotations import NYU40
 from sceneprior.core.shards import RoomViews
 
 UNIT = 0.0254

@@ -1,22 +1,29 @@
-"""Corrections of poses and masks: known errors are found, and what is right stays."""
+"""Corrections of poses and masks, and the gaps between masks of two views that tell of them."""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from untracked_room import furnished
 
-from data_prep.readers.corrected import _adjusted, _gaps, correct, moved_cameras
+from data_prep.readers.corrected import (
+    _adjusted,
+    _changed,
+    correct,
+    find_outlines,
+    hull_corners,
+    measure_gaps,
+)
 from data_prep.readers.frames import room_cameras
-from data_prep.readers.tangents import find_outlines
+from sceneprior.core.cameras import camera_at, camera_centers
 from sceneprior.core.observations import observe
 
 DEGREES, METRES = 0.5, 0.01
 
 
-@pytest.fixture
-def given(tmp_path):
+@pytest.fixture(scope="module")
+def given(tmp_path_factory):
     """Masks, world-to-camera matrices and intrinsics of a furnished room, of 320 x 240 pixels."""
-    room = furnished(tmp_path)
+    room = furnished(tmp_path_factory.mktemp("room"))
     room.size, room.focal_px = (240, 320), 160.0
     images = np.stack([room.ids(view) for view in range(len(room.poses))]).astype(np.uint32)
     poses = room_cameras(np.stack(room.poses) @ np.diag([1.0, -1, -1, 1]), np.eye(4))
@@ -26,6 +33,97 @@ def given(tmp_path):
 
 def seen_in(images):
     return observe(images, [1] * 7)
+
+
+def outlines_of(given):
+    return find_outlines(seen_in(given[0]), given[2])
+
+
+def moved_cameras(poses, change):
+    return camera_at(*_changed(poses, change))
+
+
+def test_corners_are_those_of_the_pixels_hull():
+    image = np.zeros((20, 30), dtype=np.uint8)
+    image[5:9, 4:10] = 2
+    image[7, 9] = 0
+    image[9, 6] = 2
+    corners = hull_corners(image, 2, (slice(5, 10), slice(4, 10)))
+    wanted = {(4, 5), (10, 5), (10, 9), (7, 10), (6, 10), (4, 9)}
+    assert {tuple(corner) for corner in corners.tolist()} == wanted
+
+
+def by_definition(seen, poses, intrinsics, first, second, item):
+    """Both ends of the planes' ranges, in radians about the axis, from the corners of all pixels:
+    the angle of a plane is that between its half and the half plane through a fixed point."""
+    rotations, centers = poses[:, :3, :3], camera_centers(poses)
+    axis = centers[second] - centers[first]
+    axis = axis / np.linalg.norm(axis)
+    zero = None
+    ends = []
+    for view in (first, second):
+        pixels = np.argwhere(seen.instance_ids[view] == item + 1)[:, ::-1]
+        corners = np.concatenate([pixels + each for each in ((0, 0), (1, 0), (0, 1), (1, 1))])
+        rays = np.hstack([corners, np.ones((len(corners), 1))]) @ np.linalg.inv(intrinsics[view]).T
+        rays = rays @ rotations[view]
+        halves = rays - (rays @ axis)[:, None] * axis
+        zero = halves[0] / np.linalg.norm(halves[0]) if zero is None else zero
+        angles = np.arctan2(np.cross(zero, halves) @ axis, halves @ zero)
+        ends.append((angles.min(), angles.max()))
+    return np.array(ends)
+
+
+def test_gaps_match_the_definition(given):
+    """Both ends of every tenth pair, with the pixels of all corners in place of a hull's."""
+    images, poses, intrinsics = given
+    seen, outlines = seen_in(images), outlines_of(given)
+    gaps = measure_gaps(outlines, poses, np.zeros((len(poses), 6)))
+    assert len(outlines.pairs) > 200 and gaps.valid.mean() > 0.7
+    assert np.array_equal(np.unique(outlines.item), np.arange(7))
+    for pair in np.flatnonzero(gaps.valid)[::10]:
+        first, second = outlines.pairs[pair]
+        ends = by_definition(
+            seen, poses, intrinsics, outlines.view[first], outlines.view[second],
+            outlines.item[first],
+        )  # fmt: skip
+        inside = (ends[0] - ends[1]) * [1, -1]
+        px_per_rad = gaps.gaps_px[pair] / inside
+        assert (np.sign(gaps.gaps_px[pair]) == np.sign(inside)).all()
+        assert ((px_per_rad > 0) & (px_per_rad < intrinsics[0, 0, 0])).all()
+        widths = np.ptp(ends, axis=1)
+        np.testing.assert_allclose(gaps.widths_px[pair] / widths, px_per_rad.mean(), rtol=1e-6)
+
+
+def test_exact_masks_and_poses_have_gaps_below_a_pixel_where_outlines_are_clear(given):
+    gaps = measure_gaps(outlines_of(given), given[1], np.zeros((len(given[1]), 6)))
+    sizes = gaps.used_px
+    assert len(sizes) > 100 and gaps.median_px < 0.3 and (sizes < 1).mean() > 0.9
+    assert np.abs(gaps.gaps_px[gaps.valid[:, None] & ~gaps.clear.all(axis=2)]).max() > 5
+
+
+def test_slopes_are_derivatives(given):
+    """Central differences, where the corner that touches the plane stays the same."""
+    outlines, poses, step = outlines_of(given), given[1], 1e-6
+    nothing = np.zeros((len(poses), 6))
+    gaps = measure_gaps(outlines, poses, nothing)
+    views = outlines.view[outlines.pairs]
+    for camera, place in np.ndindex(2, 6):
+        moved = []
+        for sign in (-step, step):
+            found = np.zeros_like(gaps.gaps_px)
+            for view in range(len(poses)):  # one camera at a time
+                change = nothing.copy()
+                change[view, place] = sign
+                mine = views[:, camera] == view
+                part = outlines._replace(pairs=outlines.pairs[mine])
+                found[mine] = measure_gaps(part, poses, change).gaps_px
+            moved.append(found)
+        slopes = (moved[1] - moved[0]) / (2 * step)
+        off = np.abs(slopes - gaps.slopes[..., 6 * camera + place])[gaps.valid]
+        # `gaps_px` also scales with the other camera's place, which the slopes leave out: the
+        # larger the gap, the more.
+        allowed = 1e-3 + 3 * np.abs(gaps.gaps_px[gaps.valid])
+        assert (off < allowed).mean() > 0.98
 
 
 def errors(count, seed=0):
@@ -79,15 +177,13 @@ def test_cameras_turn_about_their_centres(given):
 
 def test_a_step_solves_the_normal_equations_of_all_gaps(given, monkeypatch):
     """One step, written as weighted least squares over dense rows."""
-    images, true, intrinsics = given
-    outlines = find_outlines(seen_in(images), intrinsics)
+    outlines, true = outlines_of(given), given[1]
     poses = moved_cameras(true, errors(len(true)))
     monkeypatch.setattr("data_prep.readers.corrected._ROUNDS", 1)
-    gaps = _gaps(outlines, poses, np.zeros((len(poses), 6)))
-    used = gaps.valid[:, None] & gaps.clear.all(axis=2)
-    scale = max(1.0, np.median(np.abs(gaps.gaps_px[used])))
+    gaps = measure_gaps(outlines, poses, np.zeros((len(poses), 6)))
+    scale = max(1.0, np.median(np.abs(gaps.gaps_px[gaps.used])))
     rows, values = [], []
-    for pair, end in np.argwhere(used):
+    for pair, end in np.argwhere(gaps.used):
         gap = gaps.gaps_px[pair, end]
         row = np.zeros(6 * len(poses))
         for camera, mask in enumerate(outlines.pairs[pair]):

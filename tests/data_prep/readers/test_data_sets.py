@@ -23,10 +23,10 @@ from scan_files import write_table
 from data_prep.engine.source import RoomTask
 from data_prep.engine.workers import pool
 from data_prep.readers import open_reader
+from data_prep.readers.annotations import NYU40, SHELL, ids_and_classes
 from data_prep.readers.frames import GL_TO_CV, Y_UP
 from data_prep.readers.heading import turn_matrix
 from data_prep.readers.hypersim import pinhole, straight_grid
-from data_prep.readers.labels import NYU40, SHELL, ids_and_classes
 from data_prep.readers.rooms import FramedRoom, numbered, prepare_room
 from sceneprior.core.boxes import quarter_rotation
 from sceneprior.core.classes import STUFF, label_set

@@ -32,7 +32,7 @@ from data_prep.engine.source import Line, RoomTask
 from data_prep.engine.workers import pool
 from data_prep.inspection.agreement import true_bodies
 from data_prep.inspection.verify import agreement_of, verify
-from data_prep.readers.labels import read_labels
+from data_prep.readers.annotations import read_labels
 from data_prep.readers.rooms import prepare_room
 from data_prep.readers.scan_files import MaskArchive, read_alignment, read_sens
 from data_prep.readers.scanned_mesh import (

@@ -1,16 +1,21 @@
-"""NYU40 classes: by id, by ScanNet's raw categories, and by free-text label."""
+"""Annotations that several data sets have: tables as text, arrays in HDF5, and NYU40 classes by id,
+by ScanNet's raw categories and by free-text label."""
 
 import csv
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from data_prep.readers.files import read_table
+from sceneprior.core.checked import plain
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.id_tables import LARGEST_ID, stuff_of
 
+_MOST_VALUES = 64 << 20
+"""Maximum number of values in an array; images and trajectories have far fewer."""
 LABEL_SET = "scannet"
 TABLE = "scannetv2-labels.combined.tsv"
 SHELL = frozenset(
@@ -45,6 +50,47 @@ LIKE_NYU40 = {
     "blackboard": "whiteboard", "washbasin": "sink",
 }  # fmt: skip
 """NYU40 class of common free-text labels, such as those of ScanNet++."""
+
+
+def read_table(path: Path, hint: str, **dialect: Any) -> list[list[str]]:
+    """Rows of a text table, the header first; `hint` ends the message if it cannot be read.
+
+    `dialect` holds options of `csv.reader`; the default is comma separated.
+    """
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            return list(csv.reader(file, **dialect))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path} cannot be read ({plain(str(error), 120)}); {hint}.") from None
+
+
+def read_records(path: Path, hint: str) -> list[dict[str, str]]:
+    """Rows of a comma separated table by the names in its header; short rows lack their ends."""
+    header, *rows = read_table(path, hint) or [[]]
+    return [dict(zip(header, row, strict=False)) for row in rows if row]
+
+
+def read_hdf5(path: Path, names: Sequence[str], hint: str) -> list[np.ndarray]:
+    """Read the arrays with these names; `hint` ends the message if one is missing or unusable."""
+    import h5py  # here, because most data sets do not need it
+
+    if not path.is_file():
+        raise InputError(f"{path} is missing; {hint}.")
+    try:
+        with h5py.File(path, "r") as file:
+            missing = [name for name in names if not isinstance(file.get(name), h5py.Dataset)]
+            if missing:
+                there = ", ".join(plain(str(name)) for name in list(file)[:8]) or "nothing"
+                raise InputError(f"{path} has no '{missing[0]}' (it has {there}); {hint}.")
+            for name in names:
+                if file[name].size is None or file[name].size > _MOST_VALUES:
+                    raise InputError(f"{path}: '{name}' has {file[name].size} values; {hint}.")
+            return [np.asarray(file[name][()]) for name in names]
+    except InputError:
+        raise
+    except Exception as error:  # the type that h5py raises depends on the damage
+        reason = plain(" ".join(str(error).split()) or type(error).__name__, 120)
+        raise InputError(f"{path} cannot be read ({reason}): it is damaged; {hint}.") from None
 
 
 @dataclass(frozen=True)
