@@ -25,7 +25,7 @@ from tracks import NOISES, moved, observed, rooms
 from data_prep.front.houses import house_files, read_house
 from data_prep.front.models import ModelBank
 from data_prep.front.recipe import load_recipe
-from sceneprior.core.shards import RoomViews
+from sceneprior.core.observations import RoomViews
 from sceneprior.core.wall_lines import Door, Wall, find_walls, seen_floor
 
 NEAR_M = 0.05

@@ -30,7 +30,8 @@ from data_prep.inspection.verify import evidence_of, verify
 from data_prep.readers.posed.reader import Posed
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.shards import RoomViews, iterate_rooms, read_index
+from sceneprior.core.observations import RoomViews
+from sceneprior.core.shards import iterate_rooms, read_index
 
 TESTS = Path(__file__).parents[1] / "tests" / "data_prep"
 sys.path += [str(TESTS / "posed"), str(TESTS / "scannet")]

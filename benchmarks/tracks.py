@@ -22,8 +22,8 @@ from data_prep.readers.corrected import correct
 from data_prep.tracks.associate import FrameMasks, Tracks, associate
 from sceneprior.core.boxes import box_iou_3d
 from sceneprior.core.classes import VOID
-from sceneprior.core.observations import observe
-from sceneprior.core.shards import RoomGroundTruth, RoomViews, Shard, list_shards
+from sceneprior.core.observations import RoomGroundTruth, RoomViews, observe
+from sceneprior.core.shards import Shard, list_shards
 from sceneprior.lifted.lifting.boxes import LiftedBoxes, lift_boxes
 
 UNKNOWN = -1

@@ -15,8 +15,9 @@ from pathlib import Path
 from tracks import HEADER, NOISES, Noise, Score, find, observed, score, table_row
 
 from sceneprior.core.files import write_json
+from sceneprior.core.observations import RoomViews
 from sceneprior.core.shard_writing import shard_bytes
-from sceneprior.core.shards import INDEX_NAME, RoomViews, Shard, list_shards, read_index
+from sceneprior.core.shards import INDEX_NAME, Shard, list_shards, read_index
 
 TRAIN = "train"
 

@@ -32,8 +32,9 @@ from sceneprior.apps.viewer.latent_map import make_map
 from sceneprior.core.cameras import project
 from sceneprior.core.classes import class_colors, label_set
 from sceneprior.core.dataset import FlatViews
+from sceneprior.core.observations import RoomViews, thinned
 from sceneprior.core.proxies import icosphere, place
-from sceneprior.core.shards import RoomViews, Shard, thinned
+from sceneprior.core.shards import Shard
 from sceneprior.core.views import SceneViews
 from sceneprior.paper.decode import decode_latents
 from sceneprior.paper.interpolate import interpolate

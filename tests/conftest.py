@@ -27,7 +27,7 @@ from threadpoolctl import threadpool_limits
 from tiny_runs import tiny_config, tiny_lifted, tiny_sampler_config
 from toy_rooms import write_toy_shards
 
-from sceneprior.core.observed_image import images_of_split
+from sceneprior.core.views import images_of_split
 from sceneprior.render.offscreen import Renderer, SoftwareRenderer
 
 # Toy tensors gain nothing from a second thread, and wait for it where cores are shared: thirty

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from sceneprior.core.classes import STUFF
-from sceneprior.core.shards import RoomGroundTruth, RoomViews, stuff_size
+from sceneprior.core.observations import RoomGroundTruth, RoomViews, stuff_size
 
 
 def make_room(room_id="house_A", views=3, objects=2, size=(12, 16), seed=0):

@@ -6,9 +6,14 @@ import numpy as np
 
 from sceneprior.core.cameras import Pinhole
 from sceneprior.core.classes import STUFF
-from sceneprior.core.observations import observe
+from sceneprior.core.observations import (
+    RoomViews,
+    observe,
+    stuff_size,
+    stuff_step,
+    thinned_intrinsics,
+)
 from sceneprior.core.scene import Mesh
-from sceneprior.core.shards import RoomViews, stuff_size, stuff_step, thinned_intrinsics
 from sceneprior.render.offscreen import SoftwareRenderer
 
 SIZE, HEIGHT_M = (180, 240), 2.5

@@ -35,7 +35,7 @@ from data_prep.homes.make import make_homes
 from sceneprior.apps import cli
 from sceneprior.apps.config import load_config
 from sceneprior.core.classes import label_set
-from sceneprior.core.observed_image import image_from_shards
+from sceneprior.core.views import image_from_shards
 
 RUN_HERE = [
     "README.md", "configs/README.md", "docs/index.md", "docs/tutorial.md", "docs/concepts.md",

@@ -13,9 +13,9 @@ import trimesh
 from sceneprior.core.cameras import Pinhole
 from sceneprior.core.classes import label_set
 from sceneprior.core.files import write_whole
+from sceneprior.core.observations import RoomGroundTruth, RoomViews
 from sceneprior.core.scene import Mesh
 from sceneprior.core.shard_writing import shard_bytes
-from sceneprior.core.shards import RoomGroundTruth, RoomViews
 from sceneprior.render.offscreen import SoftwareRenderer
 
 LABEL_SET = "front3d_bedroom"

@@ -44,9 +44,10 @@ from sceneprior.core.files import (
     write_json,
     write_whole,
 )
+from sceneprior.core.observations import RoomGroundTruth, RoomViews
 from sceneprior.core.scene import Mesh
 from sceneprior.core.shard_writing import check_views, shard_bytes
-from sceneprior.core.shards import INDEX_NAME, MODELS_FOLDER, RoomGroundTruth, RoomViews
+from sceneprior.core.shards import INDEX_NAME, MODELS_FOLDER
 from sceneprior.render.offscreen import Renderer, open_renderer
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)

@@ -11,8 +11,8 @@ from typing import Any, Protocol
 
 from data_prep.engine.workers import Run
 from sceneprior.core.errors import InputError
+from sceneprior.core.observations import RoomGroundTruth, RoomViews
 from sceneprior.core.scene import Mesh
-from sceneprior.core.shards import RoomGroundTruth, RoomViews
 from sceneprior.render.offscreen import Renderer
 
 SPLITS = ("train", "val", "test")

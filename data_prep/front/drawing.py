@@ -11,16 +11,17 @@ from data_prep.front.recipe import Recipe, ViewRules
 from data_prep.front.viewpoints import Viewpoints, intrinsics, sees_enough
 from sceneprior.core.cameras import Pinhole
 from sceneprior.core.classes import STUFF, VOID, label_set
-from sceneprior.core.observations import observe, pixel_counts
-from sceneprior.core.scene import Mesh
-from sceneprior.core.shards import (
+from sceneprior.core.observations import (
     RoomGroundTruth,
     RoomViews,
+    observe,
+    pixel_counts,
     stuff_size,
     stuff_step,
     thinned,
     thinned_intrinsics,
 )
+from sceneprior.core.scene import Mesh
 from sceneprior.render.offscreen import Renderer
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import shapely
 
-from sceneprior.core.outline import Wall, walls_of
+from sceneprior.core.shell import Wall, walls_of
 from sceneprior.furniture.catalog import Model
 from sceneprior.furniture.solids import Vector
 

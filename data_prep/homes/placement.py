@@ -7,7 +7,7 @@ from math import inf
 import numpy as np
 
 from data_prep.homes.layout import Layout, Piece, point_by, yaw_at
-from sceneprior.core.outline import Wall
+from sceneprior.core.shell import Wall
 from sceneprior.furniture.catalog import Catalog, Model
 from sceneprior.furniture.solids import Vector
 

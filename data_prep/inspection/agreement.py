@@ -15,7 +15,7 @@ from sceneprior.core.boxes import BOX_EDGES, box_corners
 from sceneprior.core.cameras import to_camera, to_pixels
 from sceneprior.core.errors import ShardError
 from sceneprior.core.ground_truth import load_model, model_path
-from sceneprior.core.shards import RoomGroundTruth, RoomViews
+from sceneprior.core.observations import RoomGroundTruth, RoomViews
 
 KINDS = {"mesh": "meshes", "box": "3D boxes"}
 """Names of the types of 3D representations, for messages."""

@@ -5,8 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from sceneprior.core.classes import VOID
-from sceneprior.core.observations import observe
-from sceneprior.core.shards import RoomGroundTruth, RoomViews
+from sceneprior.core.observations import RoomGroundTruth, RoomViews, observe
 
 
 def array_problems(views: RoomViews, classes: int) -> Iterator[str]:

@@ -32,8 +32,7 @@ from data_prep.inspection.evidence import Evidence, fit, middles
 from data_prep.inspection.messages import UNITS_M, wrong_ids, wrong_unit, wrong_up
 from data_prep.tracks.associate import UNKNOWN, FrameMasks, associate
 from sceneprior.core.classes import VOID
-from sceneprior.core.observations import observe
-from sceneprior.core.shards import RoomViews
+from sceneprior.core.observations import RoomViews, observe
 
 _SPARE_AT_LEAST = 12
 """Minimum number of spare middles (`Evidence.spare`) for comparing cameras."""

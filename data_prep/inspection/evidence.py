@@ -15,7 +15,7 @@ from data_prep.inspection.camera_convention import Convention
 from data_prep.inspection.causes import Cause, corrections
 from data_prep.readers.upright import find_floor, own_sides
 from sceneprior.core.cameras import camera_centers
-from sceneprior.core.shards import RoomViews
+from sceneprior.core.observations import RoomViews
 
 TOLERANCE, OF_BOX = 0.01, 0.15
 """Distance at which the agreement of a middle is one half: a share of the longer side of the image,

@@ -11,7 +11,8 @@ from data_prep.inspection.agreement import NEAR_M
 from sceneprior.core.boxes import BOX_EDGES, box_corners
 from sceneprior.core.cameras import camera_centers, to_camera, to_pixels
 from sceneprior.core.classes import class_colors, label_set
-from sceneprior.core.shards import RoomGroundTruth, RoomViews, Shard
+from sceneprior.core.observations import RoomGroundTruth, RoomViews
+from sceneprior.core.shards import Shard
 from sceneprior.core.wall_lines import find_walls, seen_floor
 from sceneprior.render.pictures import paint_ids
 

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int, Integer
 from scipy import ndimage
 
 from sceneprior.core.boxes import yaw_rotation
-from sceneprior.core.shards import RoomViews, stuff_step, thinned, thinned_intrinsics
+from sceneprior.core.observations import RoomViews, stuff_step, thinned, thinned_intrinsics
 
 ALIGNED_DEG = 1.0
 """Maximum angle between a room's direction and an axis at which the room is not turned."""

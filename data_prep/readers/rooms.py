@@ -17,10 +17,9 @@ from sceneprior.core.boxes import CUBE_CORNERS
 from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.id_tables import IdTable, tidy
-from sceneprior.core.observations import Observations, observe
-from sceneprior.core.outline import rectangle
+from sceneprior.core.observations import Observations, RoomGroundTruth, observe, thinned_stuff
 from sceneprior.core.scene import Mesh
-from sceneprior.core.shards import RoomGroundTruth, thinned_stuff
+from sceneprior.core.shell import rectangle
 
 
 class ScannedObjects(NamedTuple):

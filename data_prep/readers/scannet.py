@@ -26,7 +26,7 @@ from data_prep.readers.scanned_mesh import AnnotatedMesh, read_annotated_mesh
 from sceneprior.core.checked import plain, shown
 from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.shards import thinned_stuff
+from sceneprior.core.observations import thinned_stuff
 
 FULL_SIZE = (968, 1296)
 QUARTER_SIZE = (242, 324)

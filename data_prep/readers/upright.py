@@ -9,8 +9,7 @@ import numpy as np
 
 from sceneprior.core.boxes import CUBE_CORNERS
 from sceneprior.core.cameras import camera_centers, nearest_to_rays, pixel_rays
-from sceneprior.core.observations import Observations
-from sceneprior.core.shards import RoomViews, Sightings
+from sceneprior.core.observations import Observations, RoomViews, Sightings
 
 VIEWS_AT_MOST = 10
 """Maximum number of views used per object; more only take longer."""

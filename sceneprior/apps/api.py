@@ -17,9 +17,8 @@ from sceneprior.apps.requests import request_of
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.observed_image import ObservedImage
 from sceneprior.core.scene import Scene, SceneObject
-from sceneprior.core.views import DecodedScenes
+from sceneprior.core.views import DecodedScenes, ObservedImage
 from sceneprior.paper.prior import TrainedPrior
 from sceneprior.paper.sampling import Point, latent_of
 from sceneprior.training.method import Trained

@@ -16,7 +16,8 @@ from sceneprior.baselines.one_stage import OneStage, OneStageConfig
 from sceneprior.core.boxes import turn_boxes
 from sceneprior.core.dataset import BLANK, RoomDataset
 from sceneprior.core.errors import ShardError
-from sceneprior.core.shards import RoomGroundTruth, Shard
+from sceneprior.core.observations import RoomGroundTruth
+from sceneprior.core.shards import Shard
 from sceneprior.core.views import RoomBoxes
 from sceneprior.paper.losses import share_of_batch
 from sceneprior.training.method import TrainedSampler, ready_copy

@@ -14,8 +14,8 @@ import shapely
 from jaxtyping import Bool, Float
 
 from sceneprior.core.colliders import colliders, is_fixed, mesh_of, points_of, volume_and_centroid
-from sceneprior.core.outline import free_floor
 from sceneprior.core.scene import Mesh, Scene, SceneObject, Solid, Textured
+from sceneprior.core.shell import floor_polygon
 
 GAP_M = 2e-3
 """Distance between objects after they are pushed apart."""
@@ -120,7 +120,11 @@ def _on_feet(item: SceneObject, changes: Counter[str]) -> SceneObject:
 
 def _apart(scene: Scene, objects: list[SceneObject], changes: Counter[str]) -> list[SceneObject]:
     """Move objects apart, the largest first; objects without a free place are left out."""
-    floor = free_floor(scene)
+    floor = floor_polygon(scene)
+    if floor is not None:  # without the squares into which doors swing
+        doors = [o for o in scene.openings if o.kind == "door"]
+        lines = [shapely.LineString([door.start_m, door.end_m]) for door in doors]
+        floor -= shapely.union_all([line.buffer(line.length, cap_style="flat") for line in lines])
     kept: dict[int, SceneObject] = {}
     taken = np.zeros((0, 2, 3))
     order = np.argsort([-item.size_m[0] * item.size_m[2] for item in objects], kind="stable")

@@ -15,7 +15,8 @@ from zlib_ng import zlib_ng
 
 from sceneprior.core.boxes import turn_vectors
 from sceneprior.core.errors import ShardError
-from sceneprior.core.shards import RoomViews, Shard, iterate_rooms
+from sceneprior.core.observations import RoomViews
+from sceneprior.core.shards import Shard, iterate_rooms
 from sceneprior.core.views import Batch, SceneViews
 
 BLANK = -1

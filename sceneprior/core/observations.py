@@ -1,13 +1,13 @@
-"""2D boxes, visibility and tracks of objects in images of instance ids."""
+"""Views of rooms: their images of instance ids, and the 2D boxes and visibility of objects in them.
+
+The 3D ground truth of a room stands beside its views."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
-from scipy import ndimage
 
 from sceneprior.core.classes import VOID
-from sceneprior.core.shards import RoomViews, Sightings, thinned_stuff
 
 MIN_BOX_SIDE_PX = 4
 """Limit on the sides of a mask's box, in pixels: an object counts as visible in a view if both
@@ -16,6 +16,116 @@ sides are longer."""
 TOUCH_PX = 4
 """Distance in pixels within which another object counts as touching a side of a mask, so that it
 may occlude the masked object."""
+
+STUFF_SIDE_PX = 240
+"""Approximate longer side of images of stuff. Their outlines are straight, so that many pixels
+measure the same line."""
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """Observations of n tracked objects in T views of H x W pixels; each object is visible in at
+    least one view."""
+
+    object_class: np.ndarray
+    """(n,) int16, index into the label set."""
+    boxes: np.ndarray
+    """(T, n, 4) float32: x1, y1, x2, y2 of the visible mask in [0, 1]; zeros if not visible."""
+    visible: np.ndarray
+    """(T, n) bool."""
+    mask_pixels: np.ndarray
+    """(T, n) int32, number of pixels of each object's visible mask."""
+    sides_clear: np.ndarray
+    """(T, n, 4) bool: True if no other object touches the mask at this side of its box, so that the
+    object ends there and is not occluded."""
+    instance_ids: np.ndarray | None
+    """(T, H, W) uint8 (uint16 if an id is above 255): 0 = background, k + 1 = object k, n + 1 =
+    void, which may occlude objects; None if the images were not read."""
+
+
+@dataclass(frozen=True)
+class RoomViews(Sightings):
+    """Views of one room: the 2D observations that training may use."""
+
+    room_id: str
+    world_to_camera: np.ndarray
+    """(T, 4, 4) float32, OpenCV axes, metres."""
+    intrinsics: np.ndarray
+    """(T, 3, 3) float32, in pixels of the H x W image."""
+    image_size: tuple[int, int]
+    """(H, W)."""
+    stuff: np.ndarray | None = None
+    """(T, h, w) uint8, index into `STUFF`: floor, walls, doors, windows and ceiling, thinned by
+    `stuff_step`; 0 for objects, other surfaces and unknown pixels. None if the source does not name
+    them, or if the images were not read."""
+    turned_deg: float = 0.0
+    """Angle about +y by which data preparation rotated the room, so that its walls run along x and
+    z."""
+    room_from_world: np.ndarray | None = None
+    """(4, 4) float64 rigid transform from the source's world, in metres; None for other rooms."""
+
+
+@dataclass(frozen=True)
+class RoomGroundTruth:
+    """3D ground truth of a room, for evaluation and baselines with 3D supervision.
+
+    Arrays with m rows have one row per object: the n tracked objects in their order, then those
+    that no view shows.
+    """
+
+    object_class: np.ndarray
+    """(m,) int16."""
+    centers_m: np.ndarray
+    """(m, 3) float32, centres of the axis-aligned boxes in the room frame."""
+    sizes_m: np.ndarray
+    """(m, 3) float32, full extents of these boxes."""
+    yaw_rad: np.ndarray
+    """(m,) float32, rotation of the piece about +y."""
+    model_ids: tuple[str, ...]
+    """(m,) names of the files `models/<id>.ply`; '' if the data set has no mesh."""
+    model_to_room: np.ndarray
+    """(m, 4, 4) float32, transform from the model's frame to the room frame, including scale."""
+    floor_m: np.ndarray
+    """(P, 2) float32, x and z along the floor's outline."""
+    height_m: float
+    """Height from floor to ceiling."""
+    unoccluded: np.ndarray | None = None
+    """(T, n) bool: True if the tracked object is fully inside the image and nothing in the room
+    occludes it. None if only objects with masks can occlude others, so that `sides_clear`
+    suffices."""
+
+
+def thinned(step: int) -> tuple[slice, slice]:
+    """Slices that downsample an image (height, width) by `step`.
+
+    They take the middle pixel of each block, so that the small image is not shifted.
+    """
+    return (slice(step // 2, None, step),) * 2
+
+
+def thinned_intrinsics(intrinsics: np.ndarray, step: int) -> np.ndarray:
+    """Intrinsics, (..., 3, 3), in pixels of images that were downsampled by `thinned`."""
+    found = np.array(intrinsics, dtype=np.float64)
+    found[..., :2, 2] += step / 2 - step // 2 - 0.5
+    found[..., :2, :] /= step
+    return found
+
+
+def stuff_step(image_size: tuple[int, int]) -> int:
+    """Step of `thinned` for images of stuff; their longer side is then about `STUFF_SIDE_PX`."""
+    return max(1, round(max(image_size) / STUFF_SIDE_PX))
+
+
+def thinned_stuff(images: np.ndarray) -> np.ndarray:
+    """The pixels of images, (..., H, W), at which stuff is kept."""
+    return images[(..., *thinned(stuff_step(images.shape[-2:])))]
+
+
+def stuff_size(image_size: tuple[int, int]) -> tuple[int, int]:
+    """Size, (h, w), of images of stuff."""
+    step = stuff_step(image_size)
+    height, width = (len(range(step // 2, side, step)) for side in image_size)
+    return height, width
 
 
 @dataclass(frozen=True)
@@ -66,6 +176,8 @@ def observe(images: np.ndarray, classes: np.ndarray | Sequence[int]) -> Observat
     Furniture of class void is not tracked but may occlude objects, so its pixels get the id after
     the last object's.
     """
+    from scipy import ndimage  # imported here: reading shards does not need it
+
     views, height, width = images.shape
     classes = np.asarray(classes, dtype=np.int16)
     is_object, meshes = classes != VOID, len(classes)

@@ -9,8 +9,8 @@ import numpy as np
 
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import ShardError
-from sceneprior.core.shard_arrays import IMAGES, TRUTH_ARRAYS, VIEW_ARRAYS, shape_of
-from sceneprior.core.shards import FORMAT, VERSION, RoomGroundTruth, RoomViews, stuff_size
+from sceneprior.core.observations import RoomGroundTruth, RoomViews, stuff_size
+from sceneprior.core.shards import FORMAT, IMAGES, TRUTH_ARRAYS, VERSION, VIEW_ARRAYS, shape_of
 
 if TYPE_CHECKING:
     import h5py

@@ -4,28 +4,16 @@ import contextlib
 import json
 import operator
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from zlib_ng import zlib_ng
 
-from sceneprior.core.classes import label_set
+from sceneprior.core.classes import STUFF, label_set
 from sceneprior.core.errors import ShardError
 from sceneprior.core.files import is_name
-from sceneprior.core.shard_arrays import (
-    IMAGES,
-    TRUTH_ARRAYS,
-    UNOCCLUDED,
-    VIEW_ARRAYS,
-    checked_images,
-    known_ids,
-    known_stuff,
-    read_arrays,
-    read_turn,
-    shape_of,
-)
+from sceneprior.core.observations import RoomGroundTruth, RoomViews, stuff_size, thinned
 
 if TYPE_CHECKING:
     import h5py
@@ -38,82 +26,31 @@ INDEX_NAME = "index.json"
 PREPARE = "`sceneprior prep-front`, `prep-scannet`, `prep-posed` or `prep-dataset`"
 """Commands that write shards, for messages."""
 MODELS_FOLDER = "models"
-STUFF_SIDE_PX = 240
-"""Approximate longer side of images of stuff. Their outlines are straight, so that many pixels
-measure the same line."""
-
-
-@dataclass(frozen=True)
-class Sightings:
-    """Observations of n tracked objects in T views of H x W pixels; each object is visible in at
-    least one view."""
-
-    object_class: np.ndarray
-    """(n,) int16, index into the label set."""
-    boxes: np.ndarray
-    """(T, n, 4) float32: x1, y1, x2, y2 of the visible mask in [0, 1]; zeros if not visible."""
-    visible: np.ndarray
-    """(T, n) bool."""
-    mask_pixels: np.ndarray
-    """(T, n) int32, number of pixels of each object's visible mask."""
-    sides_clear: np.ndarray
-    """(T, n, 4) bool: True if no other object touches the mask at this side of its box, so that the
-    object ends there and is not occluded."""
-    instance_ids: np.ndarray | None
-    """(T, H, W) uint8 (uint16 if an id is above 255): 0 = background, k + 1 = object k, n + 1 =
-    void, which may occlude objects; None if the images were not read."""
-
-
-@dataclass(frozen=True)
-class RoomViews(Sightings):
-    """Views of one room: the 2D observations that training may use."""
-
-    room_id: str
-    world_to_camera: np.ndarray
-    """(T, 4, 4) float32, OpenCV axes, metres."""
-    intrinsics: np.ndarray
-    """(T, 3, 3) float32, in pixels of the H x W image."""
-    image_size: tuple[int, int]
-    """(H, W)."""
-    stuff: np.ndarray | None = None
-    """(T, h, w) uint8, index into `STUFF`: floor, walls, doors, windows and ceiling, thinned by
-    `stuff_step`; 0 for objects, other surfaces and unknown pixels. None if the source does not name
-    them, or if the images were not read."""
-    turned_deg: float = 0.0
-    """Angle about +y by which data preparation rotated the room, so that its walls run along x and
-    z."""
-    room_from_world: np.ndarray | None = None
-    """(4, 4) float64 rigid transform from the source's world, in metres; None for other rooms."""
-
-
-@dataclass(frozen=True)
-class RoomGroundTruth:
-    """3D ground truth of a room, for evaluation and baselines with 3D supervision.
-
-    Arrays with m rows have one row per object: the n tracked objects in their order, then those
-    that no view shows.
-    """
-
-    object_class: np.ndarray
-    """(m,) int16."""
-    centers_m: np.ndarray
-    """(m, 3) float32, centres of the axis-aligned boxes in the room frame."""
-    sizes_m: np.ndarray
-    """(m, 3) float32, full extents of these boxes."""
-    yaw_rad: np.ndarray
-    """(m,) float32, rotation of the piece about +y."""
-    model_ids: tuple[str, ...]
-    """(m,) names of the files `models/<id>.ply`; '' if the data set has no mesh."""
-    model_to_room: np.ndarray
-    """(m, 4, 4) float32, transform from the model's frame to the room frame, including scale."""
-    floor_m: np.ndarray
-    """(P, 2) float32, x and z along the floor's outline."""
-    height_m: float
-    """Height from floor to ceiling."""
-    unoccluded: np.ndarray | None = None
-    """(T, n) bool: True if the tracked object is fully inside the image and nothing in the room
-    occludes it. None if only objects with masks can occlude others, so that `sides_clear`
-    suffices."""
+_Side = int | str
+VIEW_ARRAYS: dict[str, tuple[str, tuple[_Side, ...]]] = {
+    "object_class": ("int16", ("n",)),
+    "world_to_camera": ("float32", ("T", 4, 4)),
+    "intrinsics": ("float32", ("T", 3, 3)),
+    "boxes": ("float32", ("T", "n", 4)),
+    "visible": ("bool", ("T", "n")),
+    "mask_pixels": ("int32", ("T", "n")),
+    "sides_clear": ("bool", ("T", "n", 4)),
+}
+"""Type and shape of each array of a room; T views, n objects, images of H x W pixels."""
+IMAGES: dict[str, tuple[_Side, ...]] = {"instance_ids": ("T", "H", "W"), "stuff": ("T", "h", "w")}
+"""Shape of each array of images; `stuff` is optional, and has its own size, h x w."""
+TRUTH_ARRAYS: dict[str, tuple[str, tuple[_Side, ...]]] = {
+    "object_class": ("int16", ("m",)),
+    "centers_m": ("float32", ("m", 3)),
+    "sizes_m": ("float32", ("m", 3)),
+    "yaw_rad": ("float32", ("m",)),
+    "model_to_room": ("float32", ("m", 4, 4)),
+    "floor_m": ("float32", ("P", 2)),
+}
+UNOCCLUDED: dict[str, tuple[str, tuple[_Side, ...]]] = {"unoccluded": ("bool", ("T", "n"))}
+"""Optional array, for rooms in which things without a mask may occlude objects."""
+_MOST_DEFLATED = 1032
+"""Maximum compression ratio of DEFLATE."""
 
 
 class Shard(contextlib.AbstractContextManager["Shard"]):
@@ -236,6 +173,84 @@ class Shard(contextlib.AbstractContextManager["Shard"]):
             return RoomGroundTruth(model_ids=model_ids, height_m=height_m, **arrays)
 
 
+def shape_of(sides: tuple[_Side, ...], sizes: dict[str, int]) -> tuple[_Side, ...]:
+    return tuple(sizes.get(side, side) if isinstance(side, str) else side for side in sides)
+
+
+def read_arrays(
+    group: "h5py.Group",
+    arrays: dict[str, tuple[str, tuple[_Side, ...]]],
+    sizes: dict[str, int],
+    classes: int,
+) -> dict[str, np.ndarray]:
+    """Read arrays of a view shard (such as `VIEW_ARRAYS`); the type and shape of each are checked
+    before memory is allocated for it.
+
+    Shapes name dimensions by letters, such as T for views. `sizes` maps these names to lengths;
+    the lengths of names that it lacks are taken from the arrays, and added to it.
+    """
+    read: dict[str, np.ndarray] = {}
+    for name, (dtype, sides) in arrays.items():
+        stored = group[name]
+        for side, length in zip(sides, stored.shape, strict=False):
+            if isinstance(side, str):
+                sizes.setdefault(side, length)
+        shape = shape_of(sides, sizes)
+        if stored.shape != shape:
+            raise ValueError(f"{name} has shape {stored.shape}, expected {shape}")
+        if stored.dtype != dtype:
+            raise ValueError(f"{name} holds {stored.dtype}, expected {dtype}")
+        _check_size(name, stored)
+        read[name] = stored[()]
+        if dtype == "float32" and not np.isfinite(read[name]).all():
+            raise ValueError(f"{name} holds numbers that are not finite")
+    if not ((read["object_class"] >= 0) & (read["object_class"] < classes)).all():
+        raise ValueError(f"object_class is not below {classes}, the size of its label set")
+    return read
+
+
+def read_turn(group: "h5py.Group") -> dict[str, Any]:
+    """Read the attributes of a room that was rotated by data preparation; empty for other rooms."""
+    if "turned_deg" not in group.attrs:
+        return {}
+    degrees, matrix = float(group.attrs["turned_deg"]), group.attrs["room_from_world"]
+    if matrix.shape != (4, 4) or not np.isfinite([degrees, *matrix.ravel()]).all():
+        raise ValueError(f"turned_deg {degrees} and room_from_world {matrix.shape} are no turn")
+    return {"turned_deg": degrees, "room_from_world": matrix}
+
+
+def checked_images(group: "h5py.Group", name: str = "instance_ids") -> "h5py.Dataset":
+    images = group[name]
+    if images.dtype not in ("uint8", "uint16") or images.ndim != 3:
+        raise ValueError(f"{name} is {images.dtype} {images.shape}, expected uint8 (T, H, W)")
+    _check_size(name, images)
+    return images
+
+
+def _check_size(name: str, stored: "h5py.Dataset") -> None:
+    """Reject an array whose shape needs more bytes than the file can store for it.
+
+    A damaged shape may be huge.
+    """
+    if stored.nbytes > _MOST_DEFLATED * stored.id.get_storage_size():
+        raise ValueError(f"{name} claims {stored.nbytes} bytes, more than are stored")
+
+
+def known_ids(group: "h5py.Group", ids: np.ndarray) -> np.ndarray:
+    objects = group["object_class"].shape[0]
+    if (highest := int(ids.max(initial=0))) > objects + 1:
+        raise ValueError(
+            f"an instance id is {highest}, but it has {objects} objects, and {objects + 1} is void"
+        )
+    return ids
+
+
+def known_stuff(group: "h5py.Group", stuff: np.ndarray) -> np.ndarray:
+    if (highest := int(stuff.max(initial=0))) >= len(STUFF):
+        raise ValueError(f"stuff is {highest}, expected below {len(STUFF)}")
+    return stuff
+
+
 def _decoded(value: Any) -> Any:
     """Convert text as h5py reads it to `str`; leave other values unchanged."""
     return value.decode() if isinstance(value, bytes) else value
@@ -262,39 +277,6 @@ def _inflate(images: "h5py.Dataset", view: int) -> np.ndarray:
     return np.frombuffer(zlib_ng.decompress(chunk, bufsize=size), images.dtype).reshape(
         images.shape[1:]
     )
-
-
-def thinned(step: int) -> tuple[slice, slice]:
-    """Slices that downsample an image (height, width) by `step`.
-
-    They take the middle pixel of each block, so that the small image is not shifted.
-    """
-    return (slice(step // 2, None, step),) * 2
-
-
-def thinned_intrinsics(intrinsics: np.ndarray, step: int) -> np.ndarray:
-    """Intrinsics, (..., 3, 3), in pixels of images that were downsampled by `thinned`."""
-    found = np.array(intrinsics, dtype=np.float64)
-    found[..., :2, 2] += step / 2 - step // 2 - 0.5
-    found[..., :2, :] /= step
-    return found
-
-
-def stuff_step(image_size: tuple[int, int]) -> int:
-    """Step of `thinned` for images of stuff; their longer side is then about `STUFF_SIDE_PX`."""
-    return max(1, round(max(image_size) / STUFF_SIDE_PX))
-
-
-def thinned_stuff(images: np.ndarray) -> np.ndarray:
-    """The pixels of images, (..., H, W), at which stuff is kept."""
-    return images[(..., *thinned(stuff_step(images.shape[-2:])))]
-
-
-def stuff_size(image_size: tuple[int, int]) -> tuple[int, int]:
-    """Size, (h, w), of images of stuff."""
-    step = stuff_step(image_size)
-    height, width = (len(range(step // 2, side, step)) for side in image_size)
-    return height, width
 
 
 def _damaged(path: Path, error: Exception, room_id: str = "") -> ShardError:

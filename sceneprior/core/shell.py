@@ -1,6 +1,5 @@
-"""The shell of a room: floor, walls with doors and windows cut out, and ceiling."""
+"""The shell of a room: the outline of its floor, walls with doors and windows, and the ceiling."""
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
@@ -10,16 +9,11 @@ import shapely
 from jaxtyping import Float
 
 from sceneprior.core.errors import InputError
-from sceneprior.core.outline import (
-    Wall,
-    floor_rectangle,
-    rectangle,
-    wall_of_opening,
-    walls_of,
-)
 from sceneprior.core.parts import prism, triangles_of
 from sceneprior.core.scene import Mesh, Opening, Scene
 
+MARGIN_M = 0.2
+"""Distance between furniture and the edge of the assumed floor of scenes without one."""
 ShellName = Literal["walls", "floor", "none"]
 """Parts of the shell to draw or write: all of them, the floor alone, or none."""
 SHELLS: tuple[ShellName, ...] = ("walls", "floor", "none")
@@ -35,14 +29,104 @@ FLAT_RAD = 1e-3
 """Angle between two sides of the outline below which their corner is left out."""
 
 
-class Panel(NamedTuple):
-    """A solid box of a wall, beside, below or above its openings."""
+class Wall(NamedTuple):
+    """A wall along one side of the floor's outline, from the side's start to its end."""
 
-    center_m: Float[np.ndarray, "3"]
-    size_m: tuple[float, float, float]
-    """Length, height and thickness."""
-    yaw_rad: float
-    """Rotation about +y that takes +x to the direction of the wall."""
+    start_m: Float[np.ndarray, "2"]
+    end_m: Float[np.ndarray, "2"]
+    """End (x, z) of the inner face."""
+    outward: Float[np.ndarray, "2"]
+    """Unit normal (x, z) that points out of the room."""
+    openings: tuple[tuple[float, float, float, float], ...] = ()
+    """Doors and windows: start and end along the wall, bottom and top, in metres."""
+
+    @property
+    def length_m(self) -> float:
+        """Length of the inner face."""
+        return float(np.linalg.norm(self.end_m - self.start_m))
+
+    @property
+    def direction(self) -> Float[np.ndarray, "2"]:
+        """Unit vector (x, z) from the start to the end."""
+        return np.asarray((self.end_m - self.start_m) / max(self.length_m, 1e-9))
+
+    @property
+    def inward(self) -> Float[np.ndarray, "2"]:
+        """Unit normal (x, z) that points into the room."""
+        return -self.outward
+
+    def distance_m(self, point_m: Float[np.ndarray, "2"]) -> float:
+        """Distance of a point (x, z) from the inner face."""
+        line = shapely.LineString([self.start_m, self.end_m])
+        return float(line.distance(shapely.Point(point_m)))
+
+
+def walls_of(outline_m: Float[np.ndarray, "corners 2"]) -> list[Wall]:
+    """The walls on an outline of either orientation: wall 0 leads from corner 0 to corner 1."""
+    following = np.roll(outline_m, -1, axis=0)
+    x, z = outline_m.T
+    turn = np.sign((x * following[:, 1] - following[:, 0] * z).sum())
+    walls = []
+    for start, end in zip(outline_m, following, strict=True):
+        x, z = (end - start) / max(np.linalg.norm(end - start), 1e-9)
+        walls.append(Wall(start, end, np.array([z, -x]) * turn))
+    return walls
+
+
+def nearest_wall(walls: Sequence[Wall], point_m: Float[np.ndarray, "2"]) -> int:
+    """Index of the wall nearest to a point (x, z)."""
+    return int(np.argmin([wall.distance_m(point_m) for wall in walls]))
+
+
+def wall_of_opening(walls: Sequence[Wall], opening: Opening) -> int:
+    """Index of the nearest wall parallel to a door or a window."""
+    start, end = np.array(opening.start_m), np.array(opening.end_m)
+    along = (end - start) / np.linalg.norm(end - start)
+    middle = (start + end) / 2
+    return int(np.argmin([w.distance_m(middle) + 10 * abs(along @ w.outward) for w in walls]))
+
+
+def space_before(
+    opening: Opening, inward: Float[np.ndarray, "2"], depth_m: float
+) -> shapely.Polygon:
+    """The rectangle of floor in front of an opening; in front of a door, the door swings in it if
+    `depth_m` is the door's width."""
+    start, end = np.array(opening.start_m), np.array(opening.end_m)
+    return shapely.Polygon([start, end, end + depth_m * inward, start + depth_m * inward])
+
+
+def floor_polygon(scene: Scene) -> shapely.Geometry | None:
+    """The floor of a scene as a polygon; None if the scene has no outline."""
+    if scene.floor_m is None:
+        return None
+    outline = np.asarray(scene.floor_m, dtype=np.float64)
+    if outline.ndim == 2 and len(outline) >= 3 and outline.shape[1] == 2:
+        floor = shapely.make_valid(shapely.Polygon(outline))
+        if floor.area > 0:
+            return floor
+    raise InputError(
+        f"The floor of scene '{scene.name}' has no area; `floor_m` lists at least 3 corners "
+        "[x, z] in metres, or is left out."
+    )
+
+
+def floor_rectangle(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper corner (x, z) of the rectangle around the floor; without a known floor, of
+    the rectangle around the objects with a margin of 20 cm."""
+    if scene.floor_m is not None and len(scene.floor_m):
+        outline = np.asarray(scene.floor_m, dtype=np.float64)
+        return outline.min(0), outline.max(0)
+    if not scene.objects:
+        return np.array([-1.5, -1.5]), np.array([1.5, 1.5])
+    flat, half = scene.centers_m[:, [0, 2]], scene.sizes_m[:, [0, 2]] / 2
+    return (flat - half).min(0) - MARGIN_M, (flat + half).max(0) + MARGIN_M
+
+
+def rectangle(
+    low: Float[np.ndarray, "2"], high: Float[np.ndarray, "2"]
+) -> Float[np.ndarray, "4 2"]:
+    """Corners (x, z) of an axis-aligned rectangle between two opposite corners."""
+    return np.array([low, (high[0], low[1]), high, (low[0], high[1])])
 
 
 @dataclass(frozen=True)
@@ -59,9 +143,13 @@ class Shell:
     def meshes(self) -> dict[str, Mesh]:
         """Closed meshes by name: `floor`, `wall_0` and so on, and `ceiling`."""
         named = {"floor": slab(self.outline_m, -THICK_M, 0.0)}
-        corners = _outer_corners(self.walls)
+        starts = np.array([wall.start_m for wall in self.walls])
+        away = _offset(self.walls, np.full(len(self.walls), THICK_M)) - starts
+        # Outer corners are at most three thicknesses away from the inner ones.
+        far = np.linalg.norm(away, axis=1, keepdims=True)
+        corners = starts + away * np.minimum(1.0, 3 * THICK_M / far)
         for row, wall in enumerate(self.walls):
-            outer = (corners[row], corners[(row + 1) % len(corners)])
+            outer = corners[[row, (row + 1) % len(corners)]]
             named[f"wall_{row}"] = _wall_mesh(wall, outer, self.height_m)
         named["ceiling"] = slab(self.outline_m, self.height_m, self.height_m + THICK_M)
         return named
@@ -75,7 +163,14 @@ class Shell:
         meshes = self.meshes()
         towards = {f"wall_{row}": -np.insert(w.outward, 1, 0.0) for row, w in enumerate(self.walls)}
         towards["ceiling"] = np.array([0.0, -1.0, 0.0])
-        return meshes | {name: _facing(meshes[name], way) for name, way in towards.items()}
+        for name, way in towards.items():
+            vertices, faces = meshes[name].vertices_m, meshes[name].faces
+            a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+            normals = np.cross(b - a, c - a)
+            # Faces whose normals point into the room, to 8 degrees.
+            inner = normals @ way > 0.99 * np.linalg.norm(normals, axis=1)
+            meshes[name] = Mesh(vertices, faces[inner])
+        return meshes
 
 
 def shell_meshes(scene: Scene, shell: ShellName) -> dict[str, Mesh]:
@@ -103,40 +198,17 @@ def shell_of(scene: Scene) -> Shell:
     plain = _corners(outline)
     grown, grown_m = _grown(plain, scene)
     walls = walls_of(grown)
-    for opening in scene.openings:
-        row, span = _place_of(opening, walls)
-        walls[row] = walls[row]._replace(openings=(*walls[row].openings, span))
     height = ceiling_height(scene)
-    walls = [_within(wall, height) for wall in walls]
+    for opening in scene.openings:
+        row = wall_of_opening(walls, opening)
+        wall = walls[row]
+        ends = (np.array(end) - wall.start_m for end in (opening.start_m, opening.end_m))
+        start, end = sorted(float(end @ wall.direction) for end in ends)
+        start, end = max(start, 0.0), min(end, wall.length_m)
+        bottom, top = max(opening.bottom_m, 0.0), min(opening.top_m, height)
+        if start < end and bottom < top:
+            walls[row] = wall._replace(openings=(*wall.openings, (start, end, bottom, top)))
     return Shell(grown, height, tuple(walls), grown_m)
-
-
-def panels(wall: Wall, height_m: float) -> list[Panel]:
-    """Boxes that fill a wall around its openings, from its start to its end."""
-    direction = wall.direction
-    cuts = sorted({0.0, wall.length_m, *(x for o in wall.openings for x in o[:2])})
-    found = []
-    for left, right in itertools.pairwise(cuts):
-        middle = (left + right) / 2
-        free = [(0.0, height_m)]
-        for start, end, bottom, top in wall.openings:
-            if start < middle < end:
-                free = [
-                    part
-                    for low, high in free
-                    for part in ((low, min(high, bottom)), (max(low, top), high))
-                    if part[1] - part[0] > 1e-6
-                ]
-        for low, high in free:
-            x, z = wall.start_m + direction * middle + wall.outward * THICK_M / 2
-            found.append(
-                Panel(
-                    np.array([x, (low + high) / 2, z]),
-                    (right - left, high - low, THICK_M),
-                    float(np.arctan2(-direction[1], direction[0])),
-                )
-            )
-    return found
 
 
 def ceiling_height(scene: Scene) -> float:
@@ -183,7 +255,11 @@ def _grown(
                 continue
             crossed = True
             for point in shapely.get_coordinates(outside):
-                _push(point, here, walls, offsets)
+                # The sides nearest to the point move outwards until they reach it.
+                apart = np.array([wall.distance_m(point) for wall in walls_of(here)])
+                for row in np.flatnonzero(apart <= apart.min() + 1e-9):
+                    beyond = float((point - walls[row].start_m) @ walls[row].outward)
+                    offsets[row] = max(offsets[row], beyond)
         if not crossed:
             return here, float(offsets.max())
         here = _offset(walls, offsets)
@@ -195,19 +271,6 @@ def _grown(
     low, high = every.min(axis=0), every.max(axis=0)
     far = np.concatenate([corners.min(axis=0) - low, high - corners.max(axis=0)]).max()
     return rectangle(low, high), float(far)
-
-
-def _push(
-    point: Float[np.ndarray, "2"],
-    corners: Float[np.ndarray, "corners 2"],
-    walls: Sequence[Wall],
-    offsets: Float[np.ndarray, " corners"],
-) -> None:
-    """Increase the offsets of the sides nearest to a point outside until they reach it."""
-    apart = [wall.distance_m(point) for wall in walls_of(corners)]
-    for row in np.flatnonzero(np.array(apart) <= min(apart) + 1e-9).tolist():
-        beyond = float((point - walls[row].start_m) @ walls[row].outward)
-        offsets[row] = max(offsets[row], beyond)
 
 
 def _offset(
@@ -223,57 +286,14 @@ def _offset(
     return np.array(corners)
 
 
-def _outer_corners(walls: Sequence[Wall]) -> list[Float[np.ndarray, "2"]]:
-    """Corners of the walls' outer faces, at most three thicknesses away from the inner corner."""
-    corners = _offset(walls, np.full(len(walls), THICK_M))
-    cut = []
-    for wall, corner in zip(walls, corners, strict=True):
-        away = corner - wall.start_m
-        far = float(np.linalg.norm(away))
-        cut.append(wall.start_m + away * min(1.0, 3 * THICK_M / far))
-    return cut
-
-
-def _place_of(
-    opening: Opening, walls: Sequence[Wall]
-) -> tuple[int, tuple[float, float, float, float]]:
-    """Index of the nearest wall parallel to an opening, and the opening as in `Wall.openings`."""
-    row = wall_of_opening(walls, opening)
-    ends = [
-        float((np.array(point) - walls[row].start_m) @ walls[row].direction)
-        for point in (opening.start_m, opening.end_m)
-    ]
-    low, high = sorted(ends)
-    return row, (low, high, opening.bottom_m, opening.top_m)
-
-
-def _within(wall: Wall, height_m: float) -> Wall:
-    """The wall with openings cut to the wall's length and height."""
-    spans = (
-        (max(start, 0.0), min(end, wall.length_m), max(bottom, 0.0), min(top, height_m))
-        for start, end, bottom, top in wall.openings
-    )
-    return wall._replace(openings=tuple(s for s in spans if s[0] < s[1] and s[2] < s[3]))
-
-
 def slab(outline_m: Float[np.ndarray, "corners 2"], low_m: float, high_m: float) -> Mesh:
     """A closed mesh that fills an outline (x, z) between two heights."""
     return Mesh(*triangles_of(prism(outline_m, low_m, high_m)))
 
 
-def _facing(mesh: Mesh, direction: Float[np.ndarray, "3"]) -> Mesh:
-    """The faces of a mesh whose normals point in a direction, to 8 degrees."""
-    a, b, c = (mesh.vertices_m[mesh.faces[:, corner]] for corner in range(3))
-    normals = np.cross(b - a, c - a)
-    return Mesh(
-        mesh.vertices_m,
-        mesh.faces[normals @ direction > 0.99 * np.linalg.norm(normals, axis=1)],
-    )
-
-
 def _wall_mesh(
     wall: Wall,
-    outer: tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]],
+    outer: Float[np.ndarray, "2 2"],
     height_m: float,
 ) -> Mesh:
     """A wall with mitred ends, from the lower face of the floor slab to the upper face of the

@@ -14,7 +14,7 @@ from scipy import ndimage
 
 from sceneprior.core.cameras import camera_centers, pixel_rays, to_camera
 from sceneprior.core.classes import STUFF
-from sceneprior.core.shards import RoomViews, stuff_step, thinned_intrinsics
+from sceneprior.core.observations import RoomViews, stuff_step, thinned_intrinsics
 
 COARSE_M = 0.15
 """Maximum length on the floor that a pixel covers along its ray; coarser pixels are not used."""

@@ -14,9 +14,9 @@ from sceneprior.core.boxes import yaw_rotation
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json, write_whole
-from sceneprior.core.outline import floor_polygon
 from sceneprior.core.scene import Mesh, Scene, SceneObject, Turned, bound_m
 from sceneprior.core.scene_json import MOST_OBJECTS, check_box, check_floor
+from sceneprior.core.shell import floor_polygon
 from sceneprior.render.appearance import box_mesh
 
 NEEDED = ("class_labels", "translations", "sizes", "angles")

@@ -17,8 +17,8 @@ import shapely
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import json_text, write_json, write_whole
 from sceneprior.core.furniture import MODEL_FILE, category_table, class_of_category
-from sceneprior.core.outline import floor_polygon, floor_rectangle
 from sceneprior.core.scene import Scene
+from sceneprior.core.shell import floor_polygon, floor_rectangle
 from sceneprior.interchange.box_lists import floor_plan
 from sceneprior.render.appearance import scene_meshes
 

@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float, Int
 from pydantic import Field
 from torch import Tensor, nn
 
-from sceneprior.core.part_blends import blend_parts, matched_parts
 from sceneprior.core.parts import (
     KIND_NAMES,
     MOST_CORNERS,
@@ -36,6 +35,8 @@ from sceneprior.lifted.prototypes import (
 from sceneprior.lifted.rooms import PosedScenes
 from sceneprior.lifted.shape_morphing import (
     appearances_of,
+    blend_parts,
+    matched_parts,
     posed_parts,
     stretched_parts,
 )

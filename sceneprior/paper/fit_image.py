@@ -8,8 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from sceneprior.core.errors import InputError
-from sceneprior.core.observed_image import rows_of
-from sceneprior.core.views import DecodedScenes, SceneViews
+from sceneprior.core.views import DecodedScenes, SceneViews, rows_of
 from sceneprior.paper.losses import mask_loss
 from sceneprior.paper.matching import Matches
 from sceneprior.paper.prior import TrainedPrior

@@ -3,7 +3,8 @@
 Objects are rigid bodies with convex colliders; USD also serves viewers, without physics.
 """
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Iterator, Mapping
 from typing import Any
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
@@ -21,7 +22,7 @@ from sceneprior.core.colliders import (
 )
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Mesh, Scene, SceneObject, Solid
-from sceneprior.core.shell import Panel, Shell, panels
+from sceneprior.core.shell import THICK_M, Shell, Wall
 from sceneprior.render.appearance import (
     FLOOR_COLOR,
     WALL_COLOR,
@@ -174,8 +175,14 @@ def scene_to_mjcf(scene: Scene, shell: Shell | None = None) -> str:
     ):
         _add_body(world, assets, node, item, color / 255)
     for row, wall in enumerate(shell.walls if shell else ()):
-        for number, panel in enumerate(panels(wall, shell.height_m if shell else 0.0)):
-            _add_panel(world, f"wall_{row}_{number}", panel)
+        height_m = shell.height_m if shell else 0.0
+        for number, (center, half) in enumerate(boxes_of_wall(wall, height_m)):
+            yaw = np.arctan2(-wall.direction[1], wall.direction[0])
+            SubElement(
+                world, "geom", name=f"wall_{row}_{number}", type="box", size=_numbers(half),
+                pos=_numbers(TO_Z_UP @ center), axisangle=_numbers(np.array([0, 0, 1, yaw])),
+                rgba=_numbers(np.append(np.array(WALL_COLOR) / 255, WALL_OPACITY)),
+            )  # fmt: skip
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
@@ -196,16 +203,27 @@ def _add_body(
         geom.attrib |= {"mass": f"{mass:.6g}", "rgba": _numbers(np.append(color, 1))}
 
 
-def _add_panel(world: Element, name: str, panel: Panel) -> None:
-    length, height, thickness = panel.size_m
-    half = np.array([length, thickness, height]) / 2
-    geom = SubElement(world, "geom", name=name, type="box", size=_numbers(half))
-    color = np.append(np.array(WALL_COLOR) / 255, WALL_OPACITY)
-    turn = np.array([0.0, 0.0, 1.0, panel.yaw_rad])
-    geom.attrib |= {
-        "pos": _numbers(TO_Z_UP @ panel.center_m), "axisangle": _numbers(turn),
-        "rgba": _numbers(color),
-    }  # fmt: skip
+def boxes_of_wall(
+    wall: Wall, height_m: float
+) -> Iterator[tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]]:
+    """Centres, in the room frame, and half extents (along the wall, thickness, height) of boxes
+    that fill a wall beside, below and above its openings, from its start to its end."""
+    cuts = sorted({0.0, wall.length_m, *(x for o in wall.openings for x in o[:2])})
+    for left, right in itertools.pairwise(cuts):
+        middle = (left + right) / 2
+        free = [(0.0, height_m)]
+        for start, end, bottom, top in wall.openings:
+            if start < middle < end:
+                free = [
+                    part
+                    for low, high in free
+                    for part in ((low, min(high, bottom)), (max(low, top), high))
+                    if part[1] - part[0] > 1e-6
+                ]
+        for low, high in free:
+            x, z = wall.start_m + wall.direction * middle + wall.outward * THICK_M / 2
+            half = np.array([right - left, THICK_M, high - low]) / 2
+            yield np.array([x, (low + high) / 2, z]), half
 
 
 def _shape(

@@ -17,9 +17,8 @@ from PIL import Image, ImageDraw, ImageFont
 from sceneprior.core.cameras import Orthographic, Pinhole, look_at
 from sceneprior.core.classes import class_colors, label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.outline import floor_rectangle, rectangle
 from sceneprior.core.scene import Mesh, Scene
-from sceneprior.core.shell import ShellName, shell_of, slab
+from sceneprior.core.shell import ShellName, floor_rectangle, rectangle, shell_of, slab
 from sceneprior.render.appearance import (
     BACKGROUND,
     FLOOR_COLOR,

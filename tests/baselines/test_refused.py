@@ -11,8 +11,8 @@ from sceneprior.apps.config import check_config, load_any_run, load_run
 from sceneprior.apps.reconstruction.reconstruct import FitOptions, reconstruct
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.errors import ConfigError, ShardError
-from sceneprior.core.observed_image import images_of_split
 from sceneprior.core.shards import Shard
+from sceneprior.core.views import images_of_split
 from sceneprior.lifted.requests.request import RoomRequest
 from sceneprior.paper.decode import decode_training_rooms
 from sceneprior.paper.sampling import read_latent

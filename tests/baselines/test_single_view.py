@@ -25,8 +25,7 @@ from sceneprior.baselines.single_view.truth import TrueViewDataset
 from sceneprior.baselines.single_view.usl import silhouette_loss
 from sceneprior.core.boxes import turn_vectors
 from sceneprior.core.dataset import ViewDataset
-from sceneprior.core.observed_image import images_of_split
-from sceneprior.core.views import SceneViews
+from sceneprior.core.views import SceneViews, images_of_split
 from sceneprior.training.method import TrainedReconstructor
 
 

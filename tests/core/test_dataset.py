@@ -13,7 +13,8 @@ from sceneprior.core.boxes import box_corners
 from sceneprior.core.cameras import boxes_of_points
 from sceneprior.core.dataset import BLANK, MaskStore, ViewDataset
 from sceneprior.core.errors import ShardError
-from sceneprior.core.shards import RoomViews, Shard, list_shards
+from sceneprior.core.observations import RoomViews
+from sceneprior.core.shards import Shard, list_shards
 from sceneprior.core.views import RoomBoxes
 from sceneprior.training.steps import DrawSampler, make_loader
 

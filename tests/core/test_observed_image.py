@@ -5,13 +5,9 @@ import pytest
 import torch
 
 from sceneprior.core.errors import InputError
-from sceneprior.core.observed_image import (
-    as_views,
-    image_from_shards,
-    image_of_room,
-    images_of_split,
-)
-from sceneprior.core.shards import RoomViews, Shard, iterate_rooms, list_shards
+from sceneprior.core.observations import RoomViews
+from sceneprior.core.shards import Shard, iterate_rooms, list_shards
+from sceneprior.core.views import as_views, image_from_shards, image_of_room, images_of_split
 
 
 @pytest.fixture(scope="module")

@@ -18,13 +18,12 @@ from sceneprior.core.classes import label_set, label_set_name
 from sceneprior.core.coco import read_coco
 from sceneprior.core.furniture import model_categories
 from sceneprior.core.id_tables import IdTable, mask_size, read_class_table, read_mask
-from sceneprior.core.observed_image import as_views, image_from_shards, image_of_room
-from sceneprior.core.outline import floor_polygon
 from sceneprior.core.scene import Opening, Scene, SceneObject, Solid
 from sceneprior.core.scene_json import read_scene, scene_to_json
 from sceneprior.core.shard_writing import check_views
 from sceneprior.core.shards import Shard, list_shards, read_index
-from sceneprior.core.shell import shell_of
+from sceneprior.core.shell import floor_polygon, shell_of
+from sceneprior.core.views import as_views, image_from_shards, image_of_room
 
 BEDROOM = "front3d_bedroom"
 FLOOR = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [2.0, 3.0], [2.0, 2.0], [0.0, 2.0]])

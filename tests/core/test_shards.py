@@ -9,15 +9,9 @@ from made_shards import make_room, make_truth, with_stuff
 from toy_rooms import write_shard
 
 from sceneprior.core.errors import ShardError
+from sceneprior.core.observations import stuff_size, stuff_step, thinned, thinned_intrinsics
 from sceneprior.core.shard_writing import room_checksum
-from sceneprior.core.shards import (
-    Shard,
-    iterate_rooms,
-    stuff_size,
-    stuff_step,
-    thinned,
-    thinned_intrinsics,
-)
+from sceneprior.core.shards import Shard, iterate_rooms
 
 
 def assert_same(one, other):

@@ -8,7 +8,8 @@ from rooms_of_solids import solid_box
 
 from sceneprior.core.boxes import yaw_rotation
 from sceneprior.core.scene import Opening, Scene
-from sceneprior.core.shell import THICK_M, Shell, panels, shell_of
+from sceneprior.core.shell import THICK_M, Shell, shell_of
+from sceneprior.render.scene_simulators import boxes_of_wall
 
 SQUARE = np.array([[-2.0, -1.5], [2.0, -1.5], [2.0, 1.5], [-2.0, 1.5]])
 L = np.array([[-2.5, -2], [2.5, -2], [2.5, 0.5], [0.5, 0.5], [0.5, 2.2], [-2.5, 2.2]])
@@ -54,22 +55,22 @@ def test_doors_and_windows_are_holes():
         assert solid(shell, name).is_volume
 
 
-def test_panels_fill_the_walls_round_their_openings():
-    """Panels as boxes lie in the wall's mesh, and their areas add up."""
+def test_boxes_fill_the_walls_round_their_openings():
+    """The boxes lie in the wall's mesh, and their areas add up."""
     shell = shell_of(room(SLANTED, openings=(DOOR, WINDOW)))
     for row, wall in enumerate(shell.walls):
-        length = np.linalg.norm(wall.end_m - wall.start_m)
         holes = sum((end - start) * (top - bottom) for start, end, bottom, top in wall.openings)
-        boxes = panels(wall, shell.height_m)
-        area = sum(box.size_m[0] * box.size_m[1] for box in boxes)
-        assert area == pytest.approx(length * shell.height_m - holes)
+        boxes = list(boxes_of_wall(wall, shell.height_m))
+        area = sum(4 * half[0] * half[2] for _, half in boxes)
+        assert area == pytest.approx(wall.length_m * shell.height_m - holes)
         mesh = solid(shell, f"wall_{row}")
-        for box in boxes:
+        for center, half in boxes:
             turned = np.eye(4)
-            turned[:3, :3], turned[:3, 3] = yaw_rotation(box.yaw_rad), box.center_m
-            there = trimesh.creation.box(box.size_m, turned)
+            turned[:3, :3] = yaw_rotation(np.arctan2(-wall.direction[1], wall.direction[0]))
+            turned[:3, 3] = center
+            there = trimesh.creation.box(2 * half[[0, 2, 1]], turned)
             inside = trimesh.boolean.intersection([mesh, there])
-            assert inside.volume == pytest.approx(np.prod(box.size_m), rel=1e-5)
+            assert inside.volume == pytest.approx(8 * np.prod(half), rel=1e-5)
 
 
 @pytest.mark.parametrize("outline", [SQUARE, L, SLANTED])

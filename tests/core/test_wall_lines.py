@@ -8,7 +8,7 @@ import shapely
 from rooms_of_walls import DOOR, L_SHAPE, shell_room
 
 from sceneprior.core.classes import STUFF
-from sceneprior.core.shards import stuff_step, thinned_intrinsics
+from sceneprior.core.observations import stuff_step, thinned_intrinsics
 from sceneprior.core.wall_lines import COARSE_M, find_walls, on_floor, seen_floor
 
 EYES = [(-1.0, 0.5), (-1.2, -0.8), (0.9, -0.7)]

@@ -9,7 +9,7 @@ import trimesh
 from toy_rooms import write_shard
 
 from sceneprior.core.classes import label_set
-from sceneprior.core.shards import RoomGroundTruth, RoomViews
+from sceneprior.core.observations import RoomGroundTruth, RoomViews
 
 NAMES = label_set("front3d_bedroom")
 PIECES = {"double_bed": (1.8, 0.6, 2.0), "wardrobe": (1.5, 2.1, 0.6), "desk": (1.2, 0.75, 0.6)}

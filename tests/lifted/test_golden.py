@@ -12,7 +12,7 @@ import torch
 from golden_values import FOLDER, TAKE
 from tiny_runs import tiny_config, tiny_lifted
 
-from sceneprior.core.observed_image import as_views
+from sceneprior.core.views import as_views
 from sceneprior.lifted.config import TrainedLifted
 from sceneprior.lifted.losses import latent_loss, lifted_losses, match_lifted, shape_code_loss
 from sceneprior.lifted.reconstruction.objects import answer_images

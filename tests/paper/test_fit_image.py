@@ -8,7 +8,7 @@ from refusals import refused
 from torch.nn import functional as F
 from torch.testing import assert_close
 
-from sceneprior.core.observed_image import as_views, images_of_split
+from sceneprior.core.views import as_views, images_of_split
 from sceneprior.paper import fit_image
 from sceneprior.paper.fit_image import FitSchedule, decode_images, fit_latents_to_images, view_loss
 

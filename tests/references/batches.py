@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from sceneprior.core.shards import RoomViews, iterate_rooms
+from sceneprior.core.observations import RoomViews
+from sceneprior.core.shards import iterate_rooms
 
 
 def rooms_with_images(folder: Path, split: str) -> list[RoomViews]:

@@ -27,7 +27,7 @@ from data_prep.readers.reader import FoundRoom, Reader
 from data_prep.readers.rooms import FramedRoom
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.shards import thinned_stuff
+from sceneprior.core.observations import thinned_stuff
 
 TRACKS = ("given", "auto")
 

@@ -59,7 +59,7 @@ def reconstruct(
     from sceneprior.core.boxes import QUARTERS
     from sceneprior.core.errors import InputError
     from sceneprior.core.files import check_free
-    from sceneprior.core.observed_image import image_from_shards, images_of_split
+    from sceneprior.core.views import image_from_shards, images_of_split
 
     ways = [mask is not None, room is not None, split is not None]
     if sum(ways) != 1 or (shards is None) != (mask is not None):

@@ -13,8 +13,8 @@ from sceneprior.apps.rooms import PAGE_FILE, clear_scenes, write_scene
 from sceneprior.core.cameras import Pinhole, pixel_rays
 from sceneprior.core.classes import label_set
 from sceneprior.core.files import write_whole
-from sceneprior.core.observed_image import ObservedImage
 from sceneprior.core.scene import Scene
+from sceneprior.core.views import ObservedImage
 from sceneprior.evaluation.page import png_uri, write_rooms_page
 from sceneprior.render.appearance import object_colors, quiet_colors, scene_meshes
 from sceneprior.render.offscreen import SoftwareRenderer

@@ -16,9 +16,8 @@ from sceneprior.core.coco import read_coco
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
 from sceneprior.core.id_tables import IdTable, read_class_table, read_mask, tidy
-from sceneprior.core.observations import observe
-from sceneprior.core.observed_image import ObservedImage
-from sceneprior.core.shards import thinned
+from sceneprior.core.observations import observe, thinned
+from sceneprior.core.views import ObservedImage
 
 SAME_CLASS = {
     "bed": "double bed",

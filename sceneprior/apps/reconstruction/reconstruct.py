@@ -12,9 +12,8 @@ from sceneprior.core.boxes import box_corners
 from sceneprior.core.cameras import boxes_of_points
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.observed_image import ObservedImage, as_views, rows_of
 from sceneprior.core.scene import Scene, SceneObject
-from sceneprior.core.views import SceneViews
+from sceneprior.core.views import ObservedImage, SceneViews, as_views, rows_of
 from sceneprior.lifted.reconstruction.objects import answer_images
 from sceneprior.paper.decode import scene_of
 from sceneprior.paper.fit_image import SCHEDULES, fit_latents_to_images, refuse_crowds, view_loss

@@ -15,9 +15,9 @@ from sceneprior.apps.retrieval.cad_models import open_models
 from sceneprior.apps.retrieval.retrieve import retrieve_all
 from sceneprior.core.errors import InputError
 from sceneprior.core.ground_truth import models_of, reference_scenes
-from sceneprior.core.observed_image import ObservedImage, image_of_room, images_of_split
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.shards import iterate_rooms
+from sceneprior.core.views import ObservedImage, image_of_room, images_of_split
 from sceneprior.evaluation.score_table import wide_console
 from sceneprior.evaluation.view_scores import (
     POINTS,

@@ -9,8 +9,8 @@ import numpy as np
 import shapely
 
 from sceneprior.core.classes import VOID
-from sceneprior.core.outline import floor_polygon
 from sceneprior.core.scene import Scene
+from sceneprior.core.shell import floor_polygon
 from sceneprior.core.surfaces import surface_points
 from sceneprior.evaluation.metric import (
     USED,

@@ -9,8 +9,8 @@ import shapely
 from jaxtyping import Bool, Float, Int
 
 from sceneprior.core.boxes import yaw_rotation
-from sceneprior.core.outline import floor_polygon
 from sceneprior.core.scene import Opening, Scene
+from sceneprior.core.shell import floor_polygon
 from sceneprior.evaluation.metric import USED, Counts, metric
 from sceneprior.evaluation.surfaces import Triangles, footprint, own_box, triangles_of
 

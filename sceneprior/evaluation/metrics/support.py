@@ -6,8 +6,8 @@ from jaxtyping import Bool, Float
 
 from sceneprior.core.boxes import yaw_rotation
 from sceneprior.core.colliders import support_of
-from sceneprior.core.outline import floor_rectangle, rectangle
 from sceneprior.core.scene import Scene, SceneObject
+from sceneprior.core.shell import floor_rectangle, rectangle
 from sceneprior.evaluation.metric import USED, Counts, metric
 from sceneprior.evaluation.surfaces import (
     Points,

@@ -4,9 +4,8 @@ import numpy as np
 import shapely
 from jaxtyping import Bool, Int
 
-from sceneprior.core.outline import floor_polygon
 from sceneprior.core.scene import Scene, SceneObject
-from sceneprior.core.shell import ceiling_height
+from sceneprior.core.shell import ceiling_height, floor_polygon
 from sceneprior.evaluation.metric import USED, Counts, metric
 from sceneprior.evaluation.surfaces import (
     FLUSH_M,

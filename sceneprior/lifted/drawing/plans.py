@@ -13,7 +13,7 @@ from torch.nn import functional as F
 from sceneprior.core.colliders import HUNG
 from sceneprior.core.errors import InputError, InputWarning
 from sceneprior.core.mixtures import draw_index
-from sceneprior.core.outline import rectangle
+from sceneprior.core.shell import rectangle
 from sceneprior.lifted.requests.floors import Floor, RoomShape
 from sceneprior.lifted.requests.openings import place_openings
 from sceneprior.lifted.requests.request import Conditions

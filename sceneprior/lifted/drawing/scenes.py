@@ -10,9 +10,9 @@ from jaxtyping import Float
 
 from sceneprior.core.classes import label_set, unknown_class
 from sceneprior.core.errors import InputError
-from sceneprior.core.outline import rectangle
 from sceneprior.core.repeatable import single_threaded
 from sceneprior.core.scene import Mesh, Scene, SceneObject, Solid, quarter_turned
+from sceneprior.core.shell import rectangle
 from sceneprior.lifted.config import SAMPLER, TrainedLifted
 from sceneprior.lifted.drawing.draw import SampledRooms, draw_rooms
 from sceneprior.lifted.lifting import HANGS_M

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int, Real
 from numba import njit
 
 from sceneprior.core.cameras import camera_centers, nearest_to_rays, pixel_rays
-from sceneprior.core.shards import RoomViews
+from sceneprior.core.observations import RoomViews
 from sceneprior.lifted.lifting import LiftedBoxes, RayPool
 from sceneprior.lifted.lifting.hulls import (
     MOST_EMPTY,

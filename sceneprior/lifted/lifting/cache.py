@@ -18,8 +18,9 @@ from rich.console import Console
 from rich.progress import track
 
 from sceneprior.core.files import write_whole
+from sceneprior.core.observations import RoomViews
 from sceneprior.core.parts import Parts
-from sceneprior.core.shards import RoomViews, Shard, iterate_rooms
+from sceneprior.core.shards import Shard, iterate_rooms
 from sceneprior.core.wall_lines import Wall, find_walls
 from sceneprior.lifted.lifting import LiftedBoxes, ShapeGrid
 

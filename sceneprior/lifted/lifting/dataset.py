@@ -14,8 +14,9 @@ from sceneprior.core.boxes import turn_boxes
 from sceneprior.core.classes import VOID
 from sceneprior.core.dataset import BLANK, RoomDataset, allowed_views
 from sceneprior.core.errors import ShardError
+from sceneprior.core.observations import RoomViews
 from sceneprior.core.parts import filled_cells
-from sceneprior.core.shards import RoomViews, Shard
+from sceneprior.core.shards import Shard
 from sceneprior.core.wall_lines import Wall
 from sceneprior.lifted.lifting import HANGS_M, RayPool, ShapeGrid
 from sceneprior.lifted.lifting.cache import LiftedCache, fingerprint

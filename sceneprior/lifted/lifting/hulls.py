@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Integer
 from numba import njit
 
-from sceneprior.core.shards import RoomViews
+from sceneprior.core.observations import RoomViews
 from sceneprior.lifted.lifting import LiftedBoxes, ShapeGrid
 from sceneprior.render.silhouettes.cpu.kernels import in_threads
 

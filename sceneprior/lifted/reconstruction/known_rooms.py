@@ -21,10 +21,9 @@ from sceneprior.core.cameras import Pinhole, boxes_of_points
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.ground_truth import reference_scene
-from sceneprior.core.observed_image import ObservedImage, as_views, rows_of
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.core.shards import Shard, iterate_rooms
-from sceneprior.core.views import DecodedScenes
+from sceneprior.core.views import DecodedScenes, ObservedImage, as_views, rows_of
 from sceneprior.paper.matching import match_objects, matching_cost
 from sceneprior.render.appearance import scene_meshes
 from sceneprior.render.offscreen import Renderer

@@ -16,10 +16,9 @@ from torch import Tensor
 from sceneprior.core.boxes import QUARTERS, box_iou_3d, turn_vectors
 from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.observed_image import ObservedImage
 from sceneprior.core.proxies import beveled_cube, icosphere
 from sceneprior.core.scene import Scene, SceneObject
-from sceneprior.core.views import DecodedScenes
+from sceneprior.core.views import DecodedScenes, ObservedImage
 from sceneprior.lifted.prototype_decoder import PrototypeDecoder
 from sceneprior.lifted.reconstruction.known_rooms import turn_object
 from sceneprior.lifted.reconstruction.placing import Outlines, Placed, outlines_of, place_objects

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sceneprior.core.cameras import camera_centers, pixel_rays
-from sceneprior.core.observed_image import ObservedImage
+from sceneprior.core.views import ObservedImage
 
 DIRECTIONS = ((-1, 0), (0, -1), (1, 0), (0, 1), (-1, -1), (1, -1), (1, 1), (-1, 1))
 """Image directions (u, v), right and down: towards the sides of a 2D box (left, upper, right,

@@ -11,9 +11,9 @@ from jaxtyping import Float
 
 from sceneprior.core.checked import number_array
 from sceneprior.core.errors import InputError
-from sceneprior.core.outline import Wall, nearest_wall, rectangle, walls_of
 from sceneprior.core.scene import Opening
 from sceneprior.core.scene_json import check_floor, unit_guess
+from sceneprior.core.shell import Wall, nearest_wall, rectangle, walls_of
 
 NARROWEST_M = 0.3
 """Minimum side of a rectangle in which furniture is placed."""

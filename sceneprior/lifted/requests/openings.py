@@ -13,9 +13,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from sceneprior.core.checked import shown
 from sceneprior.core.errors import InputError
-from sceneprior.core.outline import Wall, space_before
 from sceneprior.core.scene import Opening
 from sceneprior.core.scene_json import check_openings
+from sceneprior.core.shell import Wall, space_before
 from sceneprior.lifted.requests.floors import Floor, RoomShape
 
 DOOR_M = (0.9, 0.0, 2.0)

@@ -30,8 +30,8 @@ import shapely
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from sceneprior.core.outline import Wall
 from sceneprior.core.scene import Opening
+from sceneprior.core.shell import Wall
 from sceneprior.lifted.requests.floors import Floor, RoomShape
 from sceneprior.lifted.requests.wishes import OPENINGS, RelationWish
 from sceneprior.lifted.rooms import PosedRooms

@@ -10,7 +10,7 @@ from PIL import Image
 
 from sceneprior.core.cameras import camera_centers
 from sceneprior.core.classes import label_set
-from sceneprior.core.observed_image import image_from_shards
+from sceneprior.core.views import image_from_shards
 from sceneprior.paper.fit_image import SCHEDULES, FitSchedule
 
 PAPER = ("--fit", "paper")

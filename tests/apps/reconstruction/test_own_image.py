@@ -20,7 +20,7 @@ from sceneprior.apps.reconstruction.own_image import (
 from sceneprior.core.cameras import camera_at
 from sceneprior.core.classes import label_set
 from sceneprior.core.id_tables import tidy
-from sceneprior.core.observed_image import images_of_split
+from sceneprior.core.views import images_of_split
 
 LABELS = "front3d_bedroom"
 INTRINSICS = "48,48,48,36"

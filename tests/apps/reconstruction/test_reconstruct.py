@@ -16,7 +16,7 @@ from sceneprior.apps.reconstruction.reconstruct import (
     starting_latents,
 )
 from sceneprior.core.classes import label_set
-from sceneprior.core.observed_image import as_views, images_of_split, rows_of
+from sceneprior.core.views import as_views, images_of_split, rows_of
 from sceneprior.paper.fit_image import SCHEDULES, FitSchedule, decode_images, view_loss
 
 

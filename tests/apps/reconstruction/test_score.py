@@ -9,7 +9,7 @@ from refusals import refused
 from sceneprior.apps.reconstruction.score import evaluate_scenes, scenes_with_images
 from sceneprior.apps.rooms import write_scenes
 from sceneprior.core.ground_truth import reference_scenes
-from sceneprior.core.observed_image import images_of_split
+from sceneprior.core.views import images_of_split
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from data_prep.front.drawing import prepare_room
 from data_prep.front.recipe import load_recipe
 from sceneprior.core.cameras import camera_centers
 from sceneprior.core.classes import STUFF
-from sceneprior.core.shards import stuff_size, stuff_step, thinned, thinned_intrinsics
+from sceneprior.core.observations import stuff_size, stuff_step, thinned, thinned_intrinsics
 from sceneprior.render.offscreen import SoftwareRenderer
 
 SMALL = ("views.image_size=[60, 80]", "views.min_object_pixels=20")

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from trimesh import Trimesh
 
 from data_prep.readers.annotations import NYU40
-from sceneprior.core.shards import RoomViews
+from sceneprior.core.observations import RoomViews
 
 UNIT = 0.0254
 """Metres per asset unit of made Hypersim scenes."""

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from sceneprior.core.shards import RoomViews, Shard, list_shards
+from sceneprior.core.observations import RoomViews
+from sceneprior.core.shards import Shard, list_shards
 from sceneprior.lifted.lifting.hulls import MOST_EMPTY, NEVER, carve, cells_along, sightings_of
 
 

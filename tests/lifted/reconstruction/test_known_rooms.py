@@ -7,7 +7,7 @@ import pytest
 from refusals import refused
 
 from sceneprior.core.ground_truth import reference_scenes
-from sceneprior.core.observed_image import images_of_split
+from sceneprior.core.views import images_of_split
 from sceneprior.lifted.reconstruction.known_rooms import (
     KnownAnswer,
     known_rooms,

@@ -7,7 +7,7 @@ from refusals import refused
 from torch.testing import assert_close
 
 from sceneprior.apps.reconstruction.own_image import level_camera
-from sceneprior.core.observed_image import ObservedImage
+from sceneprior.core.views import ObservedImage
 from sceneprior.lifted.reconstruction import objects as candidates
 from sceneprior.lifted.reconstruction.objects import (
     answer_images,

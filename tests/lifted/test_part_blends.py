@@ -5,8 +5,8 @@ import pytest
 import trimesh
 from parts_of_rooms import CORNER, TABLE
 
-from sceneprior.core.part_blends import blend_parts, matched_outlines, matched_parts
 from sceneprior.core.parts import CYLINDER, DOME, SQUARE, Parts, filled_cells, surface_of_parts
+from sceneprior.lifted.shape_morphing import blend_parts, matched_outlines, matched_parts
 
 ROUND = Parts(
     np.array([CYLINDER, CYLINDER, DOME]), np.zeros(3, np.int64),
