@@ -47,7 +47,7 @@ BUDGET = {
     "sceneprior/training": (913, 6),
     "sceneprior/paper": (2635, 16),
     "sceneprior/lifted": (8460, 48),
-    "sceneprior/baselines": (3029, 18),
+    "sceneprior/baselines": (3031, 18),
     "sceneprior/evaluation": (4511, 25),
     "sceneprior/interchange": (987, 8),
     "sceneprior/apps": (6839, 45),
