@@ -13,8 +13,8 @@ from sceneprior.lifted.lifting.cache import LiftedCache
 from sceneprior.lifted.lifting.dataset import LiftedDataset
 from sceneprior.lifted.prototype_decoder import PrototypeConfig, PrototypeDecoder
 from sceneprior.lifted.sampler.network import RoomSampler, SamplerConfig
+from sceneprior.lifted.sampler.prototype_statistics import teach
 from sceneprior.lifted.sampler.rooms import SamplerRooms
-from sceneprior.lifted.sampler.stage import teach
 
 CLASSES, CODES, CELLS, PROTOTYPES = 5, 7, 8, 12
 RAYS = 400

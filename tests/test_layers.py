@@ -83,7 +83,7 @@ OWNERS = {
     "skimage": ["sceneprior/core/surfaces", "sceneprior/lifted/lifting/part_regularizers"],
     "manifold3d": ["sceneprior/core/parts.py", "sceneprior/core/shell.py"],
     "fast_simplification": ["sceneprior/core/surfaces.py"],
-    "sklearn": ["sceneprior/evaluation/", "sceneprior/lifted/sampler/stage"],
+    "sklearn": ["sceneprior/evaluation/", "sceneprior/lifted/sampler/prototype_statistics"],
     "scipy.optimize": [
         "sceneprior/core/boxes.py", "sceneprior/lifted/shape_morphing.py",
         "sceneprior/paper/matching.py",

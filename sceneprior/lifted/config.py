@@ -162,7 +162,8 @@ class LiftedConfig(PriorConfig):
     def _build_sampler_stage(
         self, stage: SamplerConfig, rooms: SamplerRooms, previous: Path | None
     ) -> "SamplerStage":
-        from sceneprior.lifted.sampler.stage import SamplerStage, teach
+        from sceneprior.lifted.sampler.prototype_statistics import teach
+        from sceneprior.lifted.sampler.stage import SamplerStage
 
         assert previous is not None, "the shape stage comes before"
         before = self.before(previous, rooms.room_ids)

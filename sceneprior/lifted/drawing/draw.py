@@ -12,17 +12,16 @@ from jaxtyping import Int
 from torch import Tensor
 
 from sceneprior.core.errors import InputError
-from sceneprior.lifted.drawing.particles import Particles, steps_of
 from sceneprior.lifted.drawing.plans import RoomPlans, check_floor, plan_rooms
-from sceneprior.lifted.drawing.steps import NUMBERS, Rejections, place_next
+from sceneprior.lifted.drawing.steps import NUMBERS, Particles, Rejections, place_next
 from sceneprior.lifted.requests.floors import RoomShape
 from sceneprior.lifted.requests.relations import furniture_in
 from sceneprior.lifted.requests.request import Conditions
 from sceneprior.lifted.requests.rules import PlacementRules
 from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.contents import END
+from sceneprior.lifted.sampler.frames import FRAME_M, gaps_m
 from sceneprior.lifted.sampler.network import RoomSampler
-from sceneprior.lifted.sampler.rooms import FRAME_M, gaps_m
 
 OPEN_M = 3 * FRAME_M
 """Distance in metres beyond which a side of a drawn rectangle counts as empty: 1 of 370 sides in
@@ -156,7 +155,6 @@ def _furnish(
         The particles; the best one of each room, or -1 if the room is to be furnished again; and
         the classes of required objects that were left out.
     """
-    particles, last = Particles(plans, effort.particles), number == effort.attempts - 1
     rules = None
     if conditions.has_rules:
         given = [furniture_in(sampler, plans.rooms, room) for room in range(len(draws))]
@@ -166,19 +164,20 @@ def _furnish(
             for shape, own in zip(plans.shapes, given, strict=True)
             if shape is not None
         ]
+    particles = Particles(sampler, plans, effort.particles, rules)
     shape = (sampler.max_objects, effort.particles, NUMBERS)
     numbers = torch.from_numpy(np.stack([own.random(shape) for own in draws])).float()
     failed: set[int] = set()
     missing: list[list[int]] = [[] for _ in draws]
-    for step in steps_of(plans):
-        own = numbers[:, step].flatten(0, 1)
-        place_next(sampler, particles, rules, step, own, draws, rejections)
+    for step in range(max((plans.upcoming != END).sum(dim=1).tolist(), default=0)):
+        place_next(particles, step, numbers[:, step].flatten(0, 1), draws, rejections)
         dead = (~particles.alive).unflatten(0, (-1, effort.particles)).any(dim=1)
         for room in set(dead.nonzero()[:, 0].tolist()) - failed:
-            rows, required = particles.rows_of(room), bool(plans.required[room, step])
+            required = bool(plans.required[room, step])
+            rows = slice(room * effort.particles, (room + 1) * effort.particles)
             if particles.alive[rows].any():
                 particles.replace_dead(room, draws[room])
-            elif number < effort.whole or (required and not last):
+            elif number < effort.whole or (required and number < effort.attempts - 1):
                 failed.add(room)
             else:  # left out
                 particles.alive[rows] = True

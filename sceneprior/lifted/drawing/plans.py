@@ -19,9 +19,8 @@ from sceneprior.lifted.requests.openings import place_openings
 from sceneprior.lifted.requests.request import Conditions
 from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.contents import END
-from sceneprior.lifted.sampler.encoder_state import EncoderState, Frame
-from sceneprior.lifted.sampler.network import RoomSampler
-from sceneprior.lifted.sampler.rooms import rectangle_sides, rectangles_of
+from sceneprior.lifted.sampler.frames import rectangle_sides, rectangles_of
+from sceneprior.lifted.sampler.network import EncoderState, RoomSampler
 
 RECTANGLES = 16
 """Rectangles sampled for a room without a requested floor. The first one that contains the given
@@ -196,8 +195,9 @@ def read_rooms(
     first = torch.arange(most, device=number.device) < number[:, None]
     before = rooms.changed(lambda part: part[:, :most]).only(first)
     still = sampler.contents.before(coming, coming != END)[:, -1]
+    untransformed = torch.zeros_like(number)
     tokens = sampler.tokens(before, rectangle_m)
-    return sampler.read(before, still, Frame.plain(rectangle_m), tokens)
+    return sampler.read(before, still, rectangle_m, untransformed, tokens)
 
 
 def _with_looks(

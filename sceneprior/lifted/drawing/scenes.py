@@ -134,7 +134,7 @@ def _as_requested(
 def scene_of(trained: TrainedLifted, name: str, rooms: PosedRooms, row: int) -> Scene:
     """Convert a sampled room to a scene with meshes; its floor is the room's rectangle, if known.
 
-    Yaws of objects are those of the fronts of their looks (`find_fronts`).
+    Yaws of objects are those of the fronts of their looks (`find_sides`).
     """
     sampler, shapes = trained.sampler, trained.prior.shape
     assert sampler is not None, "callers ask trained.sampler first"

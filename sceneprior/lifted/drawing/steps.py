@@ -1,4 +1,5 @@
-"""One step of sequential Monte Carlo: place the next object of each particle."""
+"""One step of sequential Monte Carlo: place the next object of each particle, that is, of each
+partly furnished room."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -10,14 +11,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sceneprior.core.mixtures import draw_index
-from sceneprior.lifted.drawing.particles import Particles
-from sceneprior.lifted.drawing.plans import BEYOND_M, RoomPlans
+from sceneprior.lifted.drawing.plans import BEYOND_M, RoomPlans, read_rooms
 from sceneprior.lifted.requests.relations import Furniture, furniture_of
 from sceneprior.lifted.requests.rules import PlacementRules
-from sceneprior.lifted.sampler.encoder_state import EncoderState, Frame
-from sceneprior.lifted.sampler.network import RoomSampler
-from sceneprior.lifted.sampler.places import Places
-from sceneprior.lifted.sampler.rooms import GRAZE_M, shared_extents
+from sceneprior.lifted.sampler.contents import END
+from sceneprior.lifted.sampler.frames import GRAZE_M, shared_extents
+from sceneprior.lifted.sampler.network import EncoderState, RoomSampler
+from sceneprior.lifted.sampler.placement import Places
 
 TRIES = 4
 """Places drawn for an object in each particle; the first allowed one is taken. With more, an object
@@ -39,22 +39,88 @@ Rejections = Counter[tuple[int, str]]
 """Number of places rejected for an object, by its class and the reason."""
 
 
+class Particles:
+    """Partly furnished rooms, one or several for each room; room r has `each` rows, the first of
+    which is row r * `each`.
+
+    Args:
+        plans: The rooms' plans; all particles start with the given objects.
+        each: Number of particles of a room.
+        rules: Placement rules of each room, if the rooms have any.
+    """
+
+    def __init__(
+        self,
+        sampler: RoomSampler,
+        plans: RoomPlans,
+        each: int,
+        rules: Sequence[PlacementRules] | None,
+    ):
+        self.sampler, self.plans, self.each, self.rules = sampler, plans, each, rules
+        self.room = torch.arange(len(plans.shapes)).repeat_interleave(each)
+        self.rooms = plans.rooms.changed(lambda part: part[self.room])
+        assert self.rooms.looks is not None
+        self.looks = self.rooms.looks
+        self.number = self.rooms.is_object.sum(dim=1)
+        """Objects placed so far."""
+        self.alive = torch.ones_like(self.number, dtype=torch.bool)
+        """False for particles in which an object found no place, until they are replaced."""
+
+    def furniture(self) -> list[Furniture]:
+        """The objects of each particle."""
+        most, rooms = int(self.number.max()), self.rooms
+        every = furniture_of(
+            self.sampler,
+            *(part[:, :most].flatten(0, 1) for part in (
+                rooms.boxes_m, rooms.object_class, self.looks
+            )),
+        )  # fmt: skip
+        return [
+            every.rows(slice(row * most, row * most + number))
+            for row, number in enumerate(self.number.tolist())
+        ]
+
+    def place(
+        self,
+        rows: Int[Tensor, " some"],
+        label: Int[Tensor, " some"],
+        look: Int[Tensor, " some"],
+        boxes_m: Float[Tensor, "some 6"],
+    ) -> None:
+        """Add an object to each of some particles."""
+        at = rows, self.number[rows]
+        self.rooms.object_class[at], self.rooms.is_object[at] = label, True
+        self.rooms.boxes_m[at], self.looks[at] = boxes_m, look
+        self.number[rows] += 1
+
+    def replace_dead(self, room: int, draws: np.random.Generator) -> None:
+        """Replace each dead particle of a room by a copy of a random living one."""
+        rows = torch.arange(room * self.each, (room + 1) * self.each)
+        dead, living = rows[~self.alive[rows]], rows[self.alive[rows]]
+        chosen = living[torch.from_numpy(draws.integers(len(living), size=len(dead)))]
+        for part in (
+            self.rooms.object_class, self.rooms.is_object, self.rooms.boxes_m, self.looks,
+            self.number,
+        ):  # fmt: skip
+            part[dead] = part[chosen]
+        self.alive[dead] = True
+
+
 class Proposal(NamedTuple):
     """Next objects without a place, one in each of some particles."""
 
+    sampler: RoomSampler
     label: Int[Tensor, " some"]
     look: Int[Tensor, " some"]
     size_m: Float[Tensor, "some 3"]
     bottom_m: Float[Tensor, " some"]
     state: EncoderState
-    """Outputs of the encoder, in the frame of the rectangle in which each object is placed."""
+    """Outputs of the encoder, with the rectangle in which each object is placed."""
 
     def rows(self, rows: Int[Tensor, " fewer"]) -> "Proposal":
         """Some of these objects."""
-        return Proposal(
-            self.label[rows], self.look[rows], self.size_m[rows], self.bottom_m[rows],
-            self.state.rows(rows),
-        )  # fmt: skip
+        own = (part[rows] for part in self[1:5])
+        return Proposal(self.sampler, *own, self.state.rows(rows))
 
     def boxes_m(self, place_m: Float[Tensor, "some 2"]) -> Float[Tensor, "some 6"]:
         """Boxes of the objects at places (x, z)."""
@@ -62,19 +128,17 @@ class Proposal(NamedTuple):
         centre_m = torch.stack([place_m[:, 0], height_m, place_m[:, 1]], dim=1)
         return torch.cat([centre_m, self.size_m], dim=1)
 
-    def apart(self, sampler: RoomSampler) -> Bool[Tensor, "some objects"]:
+    def apart(self) -> Bool[Tensor, "some objects"]:
         """Objects of each room that the new object must not intersect."""
-        return ~sampler.may_meet[self.label[:, None], self.state.before.object_class]
+        return ~self.sampler.may_meet[self.label[:, None], self.state.before.object_class]
 
-    def places(self, sampler: RoomSampler) -> Places:
+    def places(self) -> Places:
         """The distribution of the objects' places."""
-        return sampler.place(self.state, self.label, self.look, self.size_m, self.bottom_m)
+        return self.sampler.place(self.state, self.label, self.look, self.size_m, self.bottom_m)
 
 
 def place_next(
-    sampler: RoomSampler,
     particles: Particles,
-    rules: Sequence[PlacementRules] | None,
     step: int,
     numbers: Float[Tensor, "rows numbers"],
     draws: Sequence[np.random.Generator],
@@ -83,36 +147,34 @@ def place_next(
     """Place the next object in all living particles; particles without a place die.
 
     Args:
-        rules: Placement rules of each room, if the rooms have any.
         numbers: `NUMBERS` uniform random numbers of each particle.
         draws: Random numbers of each room, for required objects that are searched a place.
         rejections: Counts to which rejected places are added.
     """
-    plans = particles.plans
-    going = particles.alive & (plans.upcoming[particles.room, step] != 0)
+    going = particles.alive & (particles.plans.upcoming[particles.room, step] != END)
     rows = going.nonzero()[:, 0]
     if not len(rows):
         return
-    room, numbers = particles.room[rows], numbers[rows]
-    state = particles.read(sampler, rows, step)
-    label = plans.upcoming[room, step]
-    logits = sampler.look_logits(state, label)
-    found = _proposed(sampler, state, label, logits, numbers[:, :3], plans, room)
-    x = (places := found.places(sampler)).draw_x(numbers[:, 3:].unflatten(1, (TRIES, 4))[..., :2])
-    checks = None if rules is None else _Checks(sampler, particles, rules, step)
+    now, numbers = _Step(particles, rows, step), numbers[rows]
     waiting = torch.arange(len(rows))
+    found = now.proposed(waiting, numbers[:, :3])
+    x = (places := found.places()).draw_x(numbers[:, 3:].unflatten(1, (TRIES, 4))[..., :2])
     for number in range(TRIES):
         own = found.rows(waiting)
         z_numbers = numbers[waiting, 5 + 4 * number : 7 + 4 * number]
         boxes_m = own.boxes_m(places.rows(waiting).draw(x[waiting, number], z_numbers))
-        boxes_m = resolve_overlap(boxes_m, own.state, own.apart(sampler))
-        fits = violation(boxes_m, own.state, own.apart(sampler)) == 0
-        if checks is not None:
+        boxes_m = resolve_overlap(boxes_m, own.state, own.apart())
+        fits = violation(boxes_m, own.state, own.apart()) == 0
+        if particles.rules is not None:
             free = fits.nonzero()[:, 0]
-            allowed = checks.each(rows[waiting[free]], own.rows(free), boxes_m[free])
-            for at, reason in zip(free.tolist(), allowed, strict=True):
-                fits[at] = not reason
-                if reason:
+            candidates, rectangles_m = now.candidates(own.rows(free), boxes_m[free])
+            for row, at in enumerate(free.tolist()):
+                one = slice(row, row + 1)
+                allowed, reason = now.allowed(
+                    int(waiting[at]), candidates.rows(one), rectangles_m[one], 1
+                )
+                if not allowed[0]:
+                    fits[at] = False
                     rejections[int(own.label[at]), reason] += 1
         particles.place(rows[waiting[fits]], own.label[fits], own.look[fits], boxes_m[fits])
         waiting = waiting[~fits]
@@ -120,123 +182,93 @@ def place_next(
             return
     particles.alive[rows[waiting]] = False
     lost = ~particles.alive.unflatten(0, (-1, particles.each)).any(dim=1)
-    for at in waiting[lost[room[waiting]] & plans.required[room[waiting], step]].tolist():
-        row = int(rows[at])
-        one = state.rows(torch.tensor([at]))
-        reason = _search(sampler, particles, checks, row, one, step, draws[int(room[at])])
-        particles.alive[row] = not reason
-        if reason:
-            rejections[int(found.label[at]), reason] += 1
+    required = particles.plans.required[now.room[waiting], step]
+    for at in waiting[lost[now.room[waiting]] & required].tolist():
+        if reason := now.search(at, draws[int(now.room[at])]):
+            rejections[int(now.label[at]), reason] += 1
+        else:
+            particles.alive[rows[at]] = True
 
 
-class _Checks:
-    """The rules of all rooms, applied to places of their next objects."""
+class _Step:
+    """The particles `rows` before an object of class `label` is placed in each of them."""
 
-    def __init__(
-        self,
-        sampler: RoomSampler,
-        particles: Particles,
-        rules: Sequence[PlacementRules],
-        step: int,
-    ):
-        self._sampler, self._particles, self._rules, self._step = sampler, particles, rules, step
-        most, rooms = int(particles.number.max()), particles.rooms
-        flat = (part[:, :most].flatten(0, 1) for part in (
-            rooms.boxes_m, rooms.object_class, particles.looks
-        ))  # fmt: skip
-        self._placed, self._most = furniture_of(sampler, *flat), most
-        self._number = particles.number.tolist()
+    def __init__(self, particles: Particles, rows: Int[Tensor, " some"], step: int):
+        plans, sampler = particles.plans, particles.sampler
+        self.particles, self.rows, self.room = particles, rows, particles.room[rows]
+        self.upcoming = plans.upcoming[self.room, step:]
+        self.label = self.upcoming[:, 0]
+        before = particles.rooms.changed(lambda part: part[rows])
+        self.state = read_rooms(
+            sampler, before, particles.number[rows], plans.rectangle_m[self.room], self.upcoming
+        )
+        self.logits = sampler.look_logits(self.state, self.label)
+        self._furniture = [] if particles.rules is None else particles.furniture()
+
+    def proposed(self, at: Int[Tensor, " some"], uniform: Float[Tensor, "some 3"]) -> Proposal:
+        """Draw the look and the size of the next objects of some rows, and the rectangle in which
+        each is placed, in proportion to the areas of those in which it fits."""
+        sampler, plans = self.particles.sampler, self.particles.plans
+        label, pieces_m, ceiling_m = self.label[at], plans.pieces_m[self.room[at]], plans.ceiling_m
+        look = draw_index(self.logits[at], uniform[:, 0])
+        size_m = sampler.draw_size(look, uniform[:, 1])
+        bottom_m = sampler.bottom_m(look, size_m)
+        if ceiling_m is not None:
+            highest_m = (ceiling_m - size_m[:, 1]).clamp(min=0)
+            lower_m = torch.minimum(bottom_m, highest_m)
+            bottom_m = torch.where(plans.hangs[label], highest_m, lower_m)
+        fits = (pieces_m[..., 2:] >= size_m[:, None, ::2]).all(dim=-1)
+        areas_m2 = pieces_m[..., 2:].prod(dim=-1) * (fits | ~fits.any(dim=1, keepdim=True))
+        chosen = draw_index(areas_m2.log(), uniform[:, 2])
+        rectangle_m = pieces_m[torch.arange(len(label)), chosen]
+        state = self.state.rows(at)._replace(rectangle_m=rectangle_m)
+        return Proposal(sampler, label, look, size_m, bottom_m, state)
+
+    def candidates(
+        self, found: Proposal, boxes_m: Float[Tensor, "some 6"]
+    ) -> tuple[Furniture, Float[np.ndarray, "some 4"]]:
+        """Objects at places, and the rectangle of each, as the rules read them."""
+        sampler = self.particles.sampler
+        furniture = furniture_of(sampler, boxes_m, found.label, found.look)
+        return furniture, found.state.rectangle_m.double().numpy()
 
     def allowed(
-        self, row: int, candidates: Furniture, rectangle_m: Float[np.ndarray, "some 4"], enough: int
-    ) -> tuple[Bool[np.ndarray, " candidates"], str]:
-        """`PlacementRules.allowed` of places in a particle."""
-        room, start = int(self._particles.room[row]), row * self._most
-        placed = self._placed.rows(slice(start, start + self._number[row]))
-        upcoming = self._particles.plans.upcoming[room, self._step + 1 :].tolist()
-        label = int(candidates.object_class[0])
-        return self._rules[room].allowed(label, candidates, placed, upcoming, rectangle_m, enough)
+        self, at: int, candidates: Furniture, rectangles_m: Float[np.ndarray, "some 4"], enough: int
+    ) -> tuple[Bool[np.ndarray, " some"], str]:
+        """`PlacementRules.allowed` of places of the next object of row `at`."""
+        if self.particles.rules is None:
+            return np.ones(len(rectangles_m), dtype=bool), ""
+        rules, later = self.particles.rules[int(self.room[at])], self.upcoming[at, 1:].tolist()
+        return rules.allowed(
+            int(self.label[at]), candidates, self._furniture[int(self.rows[at])], later,
+            rectangles_m, enough,
+        )  # fmt: skip
 
-    def each(
-        self, rows: Int[Tensor, " some"], found: Proposal, boxes_m: Float[Tensor, "some 6"]
-    ) -> list[str]:
-        """The reason why the object of each particle may not take its place; empty if it may."""
-        candidates = furniture_of(self._sampler, boxes_m, found.label, found.look)
-        rectangle_m = found.state.frame.rectangle_m.double().numpy()
-        reasons = []
-        for at, row in enumerate(rows.tolist()):
-            one = slice(at, at + 1)
-            allowed, reason = self.allowed(row, candidates.rows(one), rectangle_m[one], 1)
-            reasons.append("" if allowed[0] else reason)
-        return reasons
+    def search(self, at: int, draws: np.random.Generator) -> str:
+        """Place a required object anywhere in a room; the reason if there is no allowed place.
 
-
-def _proposed(
-    sampler: RoomSampler,
-    state: EncoderState,
-    label: Int[Tensor, " some"],
-    logits: Float[Tensor, "#some looks"],
-    uniform: Float[Tensor, "some 3"],
-    plans: RoomPlans,
-    room: Int[Tensor, " some"],
-) -> Proposal:
-    """Draw the look and the size of objects, and the rectangle in which each is placed, in
-    proportion to the areas of those in which it fits."""
-    pieces_m, ceiling_m = plans.pieces_m[room], plans.ceiling_m
-    look = draw_index(logits, uniform[:, 0])
-    size_m = sampler.draw_size(look, uniform[:, 1])
-    bottom_m = sampler.bottom_m(look, size_m)
-    if ceiling_m is not None:
-        highest_m = (ceiling_m - size_m[:, 1]).clamp(min=0)
-        bottom_m = torch.where(plans.hangs[label], highest_m, torch.minimum(bottom_m, highest_m))
-    fits = (pieces_m[..., 2:] >= size_m[:, None, ::2]).all(dim=-1)
-    areas_m2 = pieces_m[..., 2:].prod(dim=-1) * (fits | ~fits.any(dim=1, keepdim=True))
-    chosen = draw_index(areas_m2.log(), uniform[:, 2])
-    rectangle_m = pieces_m[torch.arange(len(label)), chosen]
-    return Proposal(label, look, size_m, bottom_m, state._replace(frame=Frame.plain(rectangle_m)))
-
-
-def _search(
-    sampler: RoomSampler,
-    particles: Particles,
-    checks: _Checks | None,
-    row: int,
-    state: EncoderState,
-    step: int,
-    draws: np.random.Generator,
-) -> str:
-    """Place a required object anywhere in the room; the reason if there is no allowed place.
-
-    Importance sampling: `CANDIDATES` with own looks and sizes are placed all over the room, and one
-    of at most `COMPARED` allowed ones is drawn in proportion to the sampler's density.
-    """
-    plans, room = particles.plans, int(particles.room[row])
-    label = plans.upcoming[room, step].expand(CANDIDATES)
-    many = state.rows(torch.zeros(CANDIDATES, dtype=torch.int64))
-    uniform = torch.from_numpy(draws.random((CANDIDATES, 3))).float()
-    logits = sampler.look_logits(state, label[:1])
-    found = _proposed(sampler, many, label, logits, uniform, plans, torch.full((CANDIDATES,), room))
-    placed_m = particles.rooms.boxes_m[row, : particles.number[row]].numpy()
-    place_m = _anywhere(
-        found.size_m[:, ::2].numpy(), found.state.frame.rectangle_m.numpy(), placed_m, draws
-    )
-    boxes_m = found.boxes_m(place_m)
-    free = (violation(boxes_m, found.state, found.apart(sampler)) == 0).nonzero()[:, 0]
-    if not len(free):
-        return "free floor"
-    if checks is not None:
-        some = found.rows(free)
-        candidates = furniture_of(sampler, boxes_m[free], some.label, some.look)
-        rectangle_m = some.state.frame.rectangle_m.double().numpy()
-        allowed, reason = checks.allowed(row, candidates, rectangle_m, COMPARED)
-        free = free[torch.from_numpy(allowed)]
+        Importance sampling: `CANDIDATES` with own looks and sizes are placed all over the room, and
+        one of at most `COMPARED` allowed ones is drawn in proportion to the sampler's density.
+        """
+        particles, row = self.particles, self.rows[at]
+        uniform = torch.from_numpy(draws.random((CANDIDATES, 3))).float()
+        found = self.proposed(torch.full((CANDIDATES,), at), uniform)
+        placed_m = particles.rooms.boxes_m[row, : particles.number[row]].numpy()
+        rectangle_m = found.state.rectangle_m.numpy()
+        place_m = _anywhere(found.size_m[:, ::2].numpy(), rectangle_m, placed_m, draws)
+        boxes_m = found.boxes_m(place_m)
+        free = (violation(boxes_m, found.state, found.apart()) == 0).nonzero()[:, 0]
         if not len(free):
+            return "free floor"
+        own = self.candidates(found.rows(free), boxes_m[free])
+        allowed, reason = self.allowed(at, *own, COMPARED)
+        fits = free[torch.from_numpy(allowed)][:COMPARED]
+        if not len(fits):
             return reason
-    fits = free[:COMPARED]
-    density = found.rows(fits).places(sampler).log_prob(boxes_m[fits][:, [0, 2]])
-    chosen = fits[draw_index(density[None], torch.tensor([draws.random()]).float())]
-    particles.place(torch.tensor([row]), label[:1], found.look[chosen], boxes_m[chosen])
-    return ""
+        density = found.rows(fits).places().log_prob(boxes_m[fits][:, [0, 2]])
+        chosen = fits[draw_index(density[None], torch.tensor([draws.random()]).float())]
+        particles.place(row[None], self.label[[at]], found.look[chosen], boxes_m[chosen])
+        return ""
 
 
 def _anywhere(
@@ -274,7 +306,7 @@ def resolve_overlap(
     least = x_and_z == x_and_z.amin(dim=-1, keepdim=True)
     moves = x_and_z * away.sign() * (least & (x_and_z <= GRAZE_M) & grazes.unsqueeze(-1))
     centre = boxes_m[:, [0, 2]] + moves.sum(dim=1)
-    middle, extents = state.frame.rectangle_m.split(2, dim=-1)
+    middle, extents = state.rectangle_m.split(2, dim=-1)
     free = ((extents - boxes_m[:, [3, 5]]) / 2).clamp(min=0)
     inside = centre.clamp(middle - free, middle + free)
     centre = inside.where((inside - centre).abs() <= GRAZE_M, centre)
@@ -297,6 +329,6 @@ def violation(
     least = torch.minimum(here[..., 3:].prod(dim=-1), theirs[..., 3:].prod(dim=-1))
     share = shared / least.clamp(min=1e-9)
     share = share.where((share > INTERSECTING) & others.is_object & apart, 0.0)
-    middle, extents = state.frame.rectangle_m.split(2, dim=-1)
+    middle, extents = state.rectangle_m.split(2, dim=-1)
     beyond = (boxes_m[:, [0, 2]] - middle).abs() + (boxes_m[:, [3, 5]] - extents) / 2
     return share.sum(dim=-1) + (beyond.amax(dim=-1) - BEYOND_M).clamp(min=0)

@@ -1,17 +1,31 @@
-"""A room's contents: its list of classes, sampled before any object is placed."""
+"""Models of a room's contents with few weights: `Contents` samples the list of classes before any
+object is placed, and `PairwisePotentials` scores the looks that suit the other furniture."""
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from sceneprior.core.boxes import QUARTERS
 from sceneprior.core.mixtures import draw_index
+from sceneprior.lifted.prototypes import POSES
+from sceneprior.lifted.rooms import PosedRooms
+from sceneprior.lifted.sampler.frames import side_of
 
 END = 0
 """Class that ends a room's list: void, which no listed object has."""
 MANY = 3
 """Number of bits ("at least 1", "at least 2" and so on) that encode the count of a class, besides
 the count itself: the first object of a class is more informative than the next ones."""
+RELATIONS = 4
+"""Number of features of the relation of a direction to an object already placed: its back points
+in the same direction, in the opposite one, or sideways; and the logarithm of the ratio of its
+extents, along the direction to across it."""
+MOST_LOG = 1.0
+"""Bound of this logarithm."""
+MEASURES = 2
+"""Number of measures of a look's footprint: the logarithm of its area, and the absolute value of
+the logarithm of the ratio of its extents."""
 
 
 class Contents(nn.Module):
@@ -94,3 +108,85 @@ class Contents(nn.Module):
             drawn[:, slot] = label * going
             counts = counts.scatter_add(1, label[:, None], going[:, None].to(counts))
         return drawn
+
+
+class PairwisePotentials(nn.Module):
+    """Scores of looks, added to the network's logits: functions with a few coefficients for each
+    class or pair of classes, which a few hundred rooms suffice to learn.
+
+    Chairs at a table point in the same direction or in opposite ones, towards its long sides; they
+    have the same shape; and a table with four chairs is large. The encoder does not learn this: it
+    sees a look as a coarse grid of its shape, in which it recognises neither the back nor that two
+    objects have the same prototype.
+
+    Args:
+        classes: Size of the label set.
+    """
+
+    def __init__(self, classes: int):
+        super().__init__()
+        self.direction_table = nn.Parameter(torch.zeros(classes, classes, RELATIONS))
+        self.repeat_table = nn.Parameter(torch.zeros(classes))
+        self.size_table = nn.Parameter(torch.zeros(classes, classes, MANY, MEASURES))
+
+    def forward(
+        self,
+        label: Int[Tensor, " rooms"],
+        before: PosedRooms,
+        counts: Float[Tensor, "rooms classes"],
+        look_shown: Float[Tensor, "looks shown"],
+        backs: Int[Tensor, " prototypes"],
+    ) -> Float[Tensor, "rooms looks"]:
+        """The scores of all looks for an object of class `label`.
+
+        Args:
+            before: The objects already placed.
+            counts: Number of objects of each class, placed and still to come.
+            look_shown: Encoding of every look; it ends with the logarithms of the extents.
+            backs: Side of every prototype's back; see `side_of`.
+        """
+        sides = side_of(torch.arange(len(look_shown), device=label.device), backs)
+        return (
+            self.directions(label, before, backs)[:, sides]
+            + self.repeats(label, before, len(look_shown))
+            + self.sizes(label, counts, look_shown)
+        )
+
+    def directions(
+        self, label: Int[Tensor, " rooms"], before: PosedRooms, backs: Int[Tensor, " prototypes"]
+    ) -> Float[Tensor, "rooms 4"]:
+        """Scores of the directions of the object's back: low z, low x, high z and high x. They are
+        sums over the objects already placed."""
+        assert before.looks is not None
+        sides = torch.arange(QUARTERS, device=label.device)
+        turned = (side_of(before.looks, backs).unsqueeze(-1) - sides) % QUARTERS
+        extents = before.boxes_m[..., [3, 5]].where(before.is_object.unsqueeze(-1), 1.0)
+        along_x = (extents[..., :1].log() - extents[..., 1:].log()).clamp(-MOST_LOG, MOST_LOG)
+        along = torch.where(sides % 2 == 1, along_x, -along_x)
+        features = torch.stack([turned == 0, turned == 2, turned % 2 == 1, along], -1)
+        table = self.direction_table[label.unsqueeze(1), before.object_class]
+        table = table * before.is_object.unsqueeze(-1)
+        return torch.einsum("rosf,rof->rs", features.to(table), table)
+
+    def repeats(
+        self, label: Int[Tensor, " rooms"], before: PosedRooms, looks: int
+    ) -> Float[Tensor, "rooms looks"]:
+        """Scores of the looks whose prototype another object of the class has; 0 for the others."""
+        assert before.looks is not None
+        same = before.is_object & (before.object_class == label.unsqueeze(1))
+        prototypes = F.one_hot(before.looks // POSES, looks // POSES) * same.unsqueeze(-1)
+        repeated = prototypes.sum(dim=1).clamp(max=1).repeat_interleave(POSES, dim=1)
+        return self.repeat_table[label].unsqueeze(1) * repeated
+
+    def sizes(
+        self,
+        label: Int[Tensor, " rooms"],
+        counts: Float[Tensor, "rooms classes"],
+        look_shown: Float[Tensor, "looks shown"],
+    ) -> Float[Tensor, "rooms looks"]:
+        """Scores of the looks' footprints, given how many objects of each class the room has."""
+        reached = counts.unsqueeze(-1) >= torch.arange(1, MANY + 1).to(counts)
+        table = self.size_table[label]
+        wanted = torch.einsum("rcm,rcmf->rf", reached.to(table), table)
+        x, z = look_shown[:, -3], look_shown[:, -1]
+        return wanted @ torch.stack([x + z, (x - z).abs()])

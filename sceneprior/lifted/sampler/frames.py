@@ -1,8 +1,10 @@
-"""The frame of an object: its room, rotated so that the object's back is at low z.
+"""Rectangles, gaps and turns of rooms as boxes: the frames in which the sampler sees rooms and
+objects.
 
-The back of a prototype is its side that is nearest to a side of the room's rectangle on average. In
-its own frame, a bed stands at the same place whichever of the four walls it stands against, so all
-four cases are learnt as one.
+The frame of an object is its room, turned so that the object's back is at low z. The back of a
+prototype is its side that is nearest to a side of the room's rectangle on average. In its own
+frame, a bed stands at the same place whichever of the four walls it stands against, so all four
+cases are learnt as one.
 """
 
 from dataclasses import replace
@@ -14,7 +16,71 @@ from torch import Tensor
 from sceneprior.core.boxes import QUARTERS, turn_boxes
 from sceneprior.lifted.prototypes import POSES, turn_posed
 from sceneprior.lifted.rooms import PosedRooms
-from sceneprior.lifted.sampler.rooms import own_sides
+
+GRAZE_M = 0.05
+"""Overlap along an axis up to which an intersection of lifted boxes is attributed to their
+inaccuracy."""
+FRAME_M = 0.15
+"""Standard deviation of the noise by which rectangles are larger than their furniture."""
+SYMMETRIES = 2 * QUARTERS
+"""Symmetries of a room: mirrored or not, times the quarter turns; 0 is the untransformed room."""
+
+
+def shared_extents(
+    boxes_m: Float[Tensor, "*#batch 6"], others_m: Float[Tensor, "*#batch 6"]
+) -> Float[Tensor, "*#batch 3"]:
+    """Overlap of two boxes (centre, full extents) along each axis; 0 where they are disjoint."""
+    apart = (boxes_m[..., :3] - others_m[..., :3]).abs()
+    total = (boxes_m[..., 3:] + others_m[..., 3:]) / 2
+    least = torch.minimum(boxes_m[..., 3:], others_m[..., 3:])
+    return torch.minimum(total - apart, least).clamp(min=0)
+
+
+def rectangles_of(rooms: PosedRooms) -> Float[Tensor, "rooms 4"]:
+    """The bounding rectangle of each room's footprints: centre x, z, extents x, z; zeros for an
+    empty room."""
+    if not rooms.boxes_m.shape[1]:
+        return rooms.boxes_m.new_zeros(len(rooms.boxes_m), 4)
+    centers, sizes = (part[..., ::2] for part in rooms.boxes_m.split(3, dim=-1))
+    nowhere = ~rooms.is_object.unsqueeze(-1)
+    low = (centers - sizes / 2).masked_fill(nowhere, torch.inf).amin(dim=1)
+    high = (centers + sizes / 2).masked_fill(nowhere, -torch.inf).amax(dim=1)
+    found = torch.cat([(low + high) / 2, high - low], dim=-1)
+    return found.where(rooms.is_object.any(dim=1, keepdim=True), 0.0)
+
+
+def rectangle_sides(
+    rectangle_m: Float[Tensor, "*batch 4"],
+) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch 2"]]:
+    """Lower and upper sides of rectangles (centre x, z, extents x, z)."""
+    middle, extents = rectangle_m.split(2, dim=-1)
+    return middle - extents / 2, middle + extents / 2
+
+
+def gaps_m(rooms: PosedRooms, rectangle_m: Float[Tensor, "rooms 4"]) -> Float[Tensor, "rooms 4"]:
+    """Gaps in metres between the furniture and the sides of a rectangle: the lower sides along x
+    and z, then the upper ones. Meaningless in rooms without furniture."""
+    low, high = rectangle_sides(rectangle_m)
+    own_low, own_high = rectangle_sides(rectangles_of(rooms))
+    return torch.cat([own_low - low, high - own_high], dim=-1)
+
+
+def gaps_to_sides_m(
+    boxes_m: Float[Tensor, "rooms objects 6"], rectangle_m: Float[Tensor, "rooms 4"]
+) -> tuple[Float[Tensor, "rooms objects 2"], Float[Tensor, "rooms objects 2"]]:
+    """Gaps in metres, along x and z, between each box and the sides of a rectangle at low x and low
+    z, and between the box and the sides at high x and high z."""
+    low, high = rectangle_sides(rectangle_m.unsqueeze(1))
+    centre, half = boxes_m[..., [0, 2]], boxes_m[..., [3, 5]] / 2
+    return centre - half - low, high - centre - half
+
+
+def own_sides(looks: Int[Tensor, "*batch"]) -> Int[Tensor, "*batch 4"]:
+    """Side of the room towards which each of the four sides of a look's prototype points; sides are
+    0 to 3 for low z, low x, high z, high x."""
+    pose, own = (looks % POSES).unsqueeze(-1), torch.arange(QUARTERS, device=looks.device)
+    # Mirroring (x reversed) comes before the turn, and reverses the direction of sides.
+    return (pose % QUARTERS + torch.where(pose >= QUARTERS, -own, own)) % QUARTERS
 
 
 def side_of(
@@ -28,14 +94,18 @@ def side_of(
     return own_sides(looks).gather(-1, sides[looks // POSES].unsqueeze(-1))[..., 0]
 
 
-def into_frames(rooms: PosedRooms, back: Int[Tensor, " rooms"]) -> PosedRooms:
-    """Turn every room so that its side `back` is at low z."""
+def turned_rooms(rooms: PosedRooms, symmetry: Int[Tensor, " rooms"]) -> PosedRooms:
+    """Every room in one of its `SYMMETRIES`: mirrored if `symmetry` is 4 or more, then turned by
+    `symmetry` % 4 quarter turns."""
     assert rooms.looks is not None
-    quarters = -back % QUARTERS
+    quarters, mirrored = symmetry % QUARTERS, symmetry >= QUARTERS
     return replace(
         rooms,
-        boxes_m=turn_boxes(rooms.boxes_m, quarters),
-        looks=turn_posed(rooms.looks, quarters, torch.zeros_like(quarters, dtype=torch.bool)),
+        boxes_m=turn_boxes(rooms.boxes_m, quarters, mirrored),
+        looks=turn_posed(rooms.looks, quarters, mirrored),
+        walls_m=None
+        if rooms.walls_m is None
+        else torch.zeros_like(rooms.walls_m).scatter(-1, own_sides(symmetry), rooms.walls_m),
     )
 
 

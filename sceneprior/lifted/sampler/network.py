@@ -2,6 +2,7 @@
 ones."""
 
 import math
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -12,13 +13,9 @@ from sceneprior.core.boxes import QUARTERS
 from sceneprior.core.mixtures import LogisticMixture, draw_index
 from sceneprior.lifted.prototypes import POSES, turn_posed
 from sceneprior.lifted.rooms import PosedRooms
-from sceneprior.lifted.sampler.contents import Contents
-from sceneprior.lifted.sampler.encoder_state import LENGTHS, EncoderState, Frame, fourier_features
-from sceneprior.lifted.sampler.pairwise_potentials import PairwisePotentials
-from sceneprior.lifted.sampler.placement import SHOWN, Placement
-from sceneprior.lifted.sampler.places import Places
-from sceneprior.lifted.sampler.prototype_statistics import SIZES
-from sceneprior.lifted.sampler.rooms import SYMMETRIES, gaps_m, rectangle_sides
+from sceneprior.lifted.sampler.contents import Contents, PairwisePotentials
+from sceneprior.lifted.sampler.frames import SYMMETRIES, gaps_m, rectangle_sides
+from sceneprior.lifted.sampler.placement import SHOWN, Placement, Places
 from sceneprior.paper.layers import mlp
 from sceneprior.training.method import TrainConfig
 
@@ -30,14 +27,20 @@ EXTENTS = 4
 """Components of the logistic mixture of an object's extents."""
 MATCH_WIDTH = 64
 """Dimension of the query and the keys by which looks are compared."""
-
-
-def _own_pose() -> Int[Tensor, "symmetries poses"]:
-    symmetry, own = torch.arange(SYMMETRIES), torch.arange(POSES).expand(SYMMETRIES, -1)
-    return turn_posed(own, symmetry % QUARTERS, symmetry >= QUARTERS).argsort(dim=1)
-
-
-OWN_POSE = _own_pose()
+SIZES = 32
+"""Maximum number of sizes of a prototype; the most frequent ones are kept."""
+OCTAVES = 6
+"""Frequencies in the encoding of a length."""
+LONGEST_M = 16.0
+"""Longest period of that encoding, which has a sine and a cosine for each of `OCTAVES` periods;
+each is half the previous one."""
+LENGTHS = 1 + 2 * OCTAVES
+"""Number of values that encode a length."""
+OWN_POSE = turn_posed(
+    torch.arange(POSES).expand(SYMMETRIES, -1),
+    torch.arange(SYMMETRIES) % QUARTERS,
+    torch.arange(SYMMETRIES) >= QUARTERS,
+).argsort(dim=1)
 """Maps (room symmetry, observed pose) to the pose in the untransformed room."""
 
 
@@ -62,6 +65,26 @@ class SamplerConfig(TrainConfig):
         if self.width % self.heads:
             raise ValueError(f"width {self.width} is not a multiple of heads {self.heads}")
         return self
+
+
+class EncoderState(NamedTuple):
+    """Encoder outputs for partly furnished rooms."""
+
+    before: PosedRooms
+    rectangle_m: Float[Tensor, "rooms 4"]
+    """Rectangle that the furniture may fill: centre x, z and extents x, z."""
+    symmetry: Int[Tensor, " rooms"]
+    """Index of the symmetry, out of `SYMMETRIES`, in which each room is presented; 0 is
+    untransformed."""
+    coming: Float[Tensor, "rooms classes"]
+    """Number of objects of each class that are still to be placed."""
+    context: Float[Tensor, "rooms width"]
+    """Output of the query: the context for the next object."""
+
+    def rows(self, rows: Int[Tensor, " some"]) -> "EncoderState":
+        """These outputs, reduced to the rooms with these indices."""
+        before, *others = self
+        return EncoderState(before.changed(lambda part: part[rows]), *(o[rows] for o in others))
 
 
 class RoomSampler(nn.Module):
@@ -181,32 +204,36 @@ class RoomSampler(nn.Module):
         self,
         before: PosedRooms,
         coming: Float[Tensor, "rooms classes"],
-        frame: Frame,
+        rectangle_m: Float[Tensor, "rooms 4"],
+        symmetry: Int[Tensor, " rooms"],
         tokens: Float[Tensor, "rooms objects width"],
     ) -> EncoderState:
         """Encode the objects placed so far, in any order, from their `tokens`, and the counts of
         each class still to come."""
-        query = self.query + self.summary_embedding(self.summary(before, coming, frame))
-        shown = self.rectangle_embedding(fourier_features(frame.rectangle_m))
+        query = self.query + self.summary_embedding(self.summary(before, coming, rectangle_m))
+        shown = self.rectangle_embedding(fourier_features(rectangle_m))
         features = torch.cat([query.unsqueeze(1), shown.unsqueeze(1), tokens], dim=1)
         features = self.dropout(features)
         nothing = torch.cat([before.is_object.new_zeros(len(tokens), 2), ~before.is_object], dim=1)
         for layer in self.encoder:
             features = layer(features, src_key_padding_mask=nothing)
         features = self.norm(features)
-        return EncoderState(before, frame, coming, features[:, 0])
+        return EncoderState(before, rectangle_m, symmetry, coming, features[:, 0])
 
     def summary(
-        self, before: PosedRooms, coming: Float[Tensor, "rooms classes"], frame: Frame
+        self,
+        before: PosedRooms,
+        coming: Float[Tensor, "rooms classes"],
+        rectangle_m: Float[Tensor, "rooms 4"],
     ) -> Float[Tensor, "rooms summary"]:
         """Features that attention could only obtain by counting: the number of objects of each
         class, placed and still to come, and the gaps between the furniture and each side of the
         rectangle, which are small in a finished room."""
         counts = self.counts(before)
         furnished = before.is_object.any(dim=1, keepdim=True)
-        low, high = rectangle_sides(frame.rectangle_m)
+        low, high = rectangle_sides(rectangle_m)
         whole = torch.cat([high - low] * 2, dim=-1)
-        gaps = gaps_m(before, frame.rectangle_m).where(furnished, whole)
+        gaps = gaps_m(before, rectangle_m).where(furnished, whole)
         return torch.cat([counts, coming, fourier_features(gaps)], dim=-1)
 
     def look_logits(
@@ -220,17 +247,11 @@ class RoomSampler(nn.Module):
         logits = self.wanted_look(known) @ offered.T / math.sqrt(MATCH_WIDTH)
         own_pose = OWN_POSE.to(self.frequency.device)
         frequency = self.frequency[:, own_pose].transpose(0, 1).flatten(1)[:, : self.looks]
-        logits = logits + frequency[state.frame.symmetry]
+        logits = logits + frequency[state.symmetry]
         counts = self.counts(state.before) + state.coming
         logits = logits + self.look_scores(label, state.before, counts, shown, self.backs)
         others = self.look_class[: self.looks] != label.unsqueeze(-1)
         return logits.masked_fill(others, -torch.inf)
-
-    def extents(
-        self, state: EncoderState, label: Int[Tensor, " rooms"], look: Int[Tensor, " rooms"]
-    ) -> LogisticMixture:
-        """Distribution of the object's log extents, relative to those of its look."""
-        return LogisticMixture.of(self.extents_head(self._known(state, label, look)), 3)
 
     def draw_size(
         self, look: Int[Tensor, " rooms"], uniform: Float[Tensor, " rooms"]
@@ -263,7 +284,7 @@ class RoomSampler(nn.Module):
         """Distribution of the x and z of the object's centre."""
         counts = torch.cat([self.counts(state.before), state.coming], dim=-1)
         return self.placement(
-            label, look, size_m, bottom_m, state.frame.rectangle_m, state.before, counts,
+            label, look, size_m, bottom_m, state.rectangle_m, state.before, counts,
             self.look_shown, self.backs,
         )  # fmt: skip
 
@@ -281,19 +302,16 @@ class RoomSampler(nn.Module):
         centre_m, size_m = coming.boxes_m[:, 0].split(3, dim=-1)
         bottom_m = centre_m[:, 1] - size_m[:, 1] / 2
         looks = self.look_logits(state, label).log_softmax(dim=-1)
-        extents = size_m.log() - self.look_shown[look, -3:]
+        # The distribution of the log extents, relative to those of the look.
+        known = [state.context, self.class_embedding(label)]
+        known.append(self.look_embedding(self.look_shown[look]))
+        extents = LogisticMixture.of(self.extents_head(torch.cat(known, dim=-1)), 3)
         place = self.place(state, label, look, size_m, bottom_m)
         return {
             "look": looks.gather(-1, look.unsqueeze(-1))[:, 0],
-            "size": self.extents(state, label, look).log_prob(extents),
+            "size": extents.log_prob(size_m.log() - self.look_shown[look, -3:]),
             "place": place.log_prob(centre_m[:, ::2]),
         }
-
-    def _known(
-        self, state: EncoderState, label: Int[Tensor, " rooms"], look: Int[Tensor, " rooms"]
-    ) -> Float[Tensor, "rooms known"]:
-        look_seen = self.look_embedding(self.look_shown[look])
-        return torch.cat([state.context, self.class_embedding(label), look_seen], dim=-1)
 
 
 def _swapped(
@@ -306,3 +324,11 @@ def _swapped(
 
 def _head(inputs: int, width: int, outputs: int) -> nn.Sequential:
     return mlp(nn.Linear(inputs, width), nn.Linear(width, outputs))
+
+
+def fourier_features(lengths_m: Float[Tensor, "*batch numbers"]) -> Float[Tensor, "*batch shown"]:
+    """Encode lengths: the lengths themselves (in units of 4 m), then their Fourier features, a sine
+    and a cosine for each of `OCTAVES` periods."""
+    octaves = torch.arange(OCTAVES, device=lengths_m.device, dtype=lengths_m.dtype)
+    phase = (lengths_m.unsqueeze(-1) * (2 * math.pi / LONGEST_M * 2**octaves)).flatten(-2)
+    return torch.cat([lengths_m / 4, phase.sin(), phase.cos()], dim=-1)

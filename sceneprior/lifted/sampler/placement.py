@@ -1,28 +1,25 @@
-"""The distribution of an object's place, as a choice between places relative to the room and to the
-objects already placed."""
+"""The distribution of an object's place, as a mixture around anchors: positions relative to the
+room and to the objects already placed."""
 
 import math
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from sceneprior.core.boxes import QUARTERS
 from sceneprior.core.mixtures import FIRST_SCALE, LogisticMixture
-from sceneprior.lifted.prototypes import PARTS
+from sceneprior.lifted.prototypes import PARTS, turn_posed
 from sceneprior.lifted.rooms import PosedRooms
-from sceneprior.lifted.sampler.frames import into_frames, side_of, turn_rectangles
-from sceneprior.lifted.sampler.places import (
-    BY_OBJECT,
-    BY_SIDES,
-    GAPS_M,
-    OF_OBJECT,
-    OF_SIDES,
-    Anchors,
-    Places,
-    ramps,
+from sceneprior.lifted.sampler.frames import (
+    gaps_to_sides_m,
+    shared_extents,
+    side_of,
+    turn_places,
+    turn_rectangles,
+    turned_rooms,
 )
-from sceneprior.lifted.sampler.rooms import gaps_to_sides_m, shared_extents
 
 SHOWN = PARTS**3 + 3
 """Numbers that encode a look: its coarse grid and the logarithms of its extents."""
@@ -37,6 +34,233 @@ at one of the two anchors at each position given by the room, and at anchors `AP
 object."""
 SHIFT_M = 0.3
 """Shift of an anchor in metres for a network output of 1."""
+BY_SIDES = 8
+"""Number of anchors along an axis given by the room: a narrow and a wide one at each of four
+positions. These are flush with the lower side of the rectangle, flush with its upper side, in its
+middle, and at the origin, which is the middle of the floor."""
+BY_OBJECT = 7
+"""Number of anchors along an axis per object already placed: adjacent before it, flush with its
+lower side, centred, flush with its upper side, adjacent behind it, and `APART_M` before and behind
+it."""
+APART_M = 0.4
+"""Gap between an object and the two anchors apart from it."""
+SHARPNESS, SPREAD = 1.5, 0.7
+"""Sampling raises the weights of anchors to the power `SHARPNESS` and multiplies the scales by
+`SPREAD`, because distributions learnt from a few hundred rooms are broader than those of the
+rooms."""
+GAPS_M = (-0.4, -0.15, -0.05, 0.0, 0.05, 0.15, 0.4, 1.0, 2.0)
+"""Knots of `ramps` for gaps; negative gaps are overlaps."""
+OFFSETS_M = (-1.5, -0.7, -0.3, -0.1, -0.03, 0.03, 0.1, 0.3, 0.7, 1.5)
+"""Knots of `ramps` for offsets of centres and sides."""
+OF_GAP, OF_OFFSET = len(GAPS_M) - 1, len(OFFSETS_M) - 1
+OF_OBJECT, OF_SIDES = OF_GAP + 3 * OF_OFFSET, 2 * OF_GAP
+"""Number of features, along an axis, of the relation to an object, and of the relations to the two
+sides of the rectangle."""
+
+
+def ramps(lengths_m: Float[Tensor, "*batch n"], knots_m: tuple[float, ...]) -> Tensor:
+    """Piecewise linear features of lengths: each rises from 0 to 1 between two knots.
+
+    Example:
+
+        >>> ramps(torch.tensor([0.5]), (0.0, 1.0, 2.0))
+        tensor([0.5000, 0.0000])
+    """
+    knots = torch.tensor(knots_m).to(lengths_m)
+    rising = lengths_m.unsqueeze(-1) - knots[:-1]
+    return rising.div_(knots.diff()).clamp_(0, 1).flatten(-2)
+
+
+class Anchors(NamedTuple):
+    """Candidate positions of an object along an axis."""
+
+    at_m: Float[Tensor, "rooms anchors"]
+    exists: Bool[Tensor, "rooms anchors"]
+    """False for the anchors of padding."""
+    kind: Int[Tensor, " anchors"]
+    """0 to 7 for anchors given by the room, 8 to 14 for anchors of an object."""
+
+
+class Places(NamedTuple):
+    """The distribution of the next object's centre (x, z) in each room. Tensors refer to the frame
+    of that object (`frames.py`)."""
+
+    placement: "Placement"
+    label: Int[Tensor, " rooms"]
+    object_class: Int[Tensor, "rooms objects"]
+    own: Float[Tensor, "rooms width"]
+    there: Float[Tensor, "rooms objects width"]
+    size_m: Float[Tensor, "rooms 2"]
+    rectangle_m: Float[Tensor, "rooms 4"]
+    footprints_m: Float[Tensor, "rooms objects 4"]
+    """Centre x, z and extents x, z of the objects already placed."""
+    is_object: Bool[Tensor, "rooms objects"]
+    meets: Bool[Tensor, "rooms objects"]
+    """True for placed objects whose vertical extent overlaps with that of the object to be
+    placed."""
+    quarters: Int[Tensor, " rooms"]
+    """Quarter turns that take the room to the frame."""
+
+    def rows(self, rows: Int[Tensor, " some"]) -> "Places":
+        """The distribution in these rooms."""
+        return Places(self.placement, *(part[rows] for part in self[1:]))
+
+    def log_prob(self, place_m: Float[Tensor, "rooms 2"]) -> Float[Tensor, " rooms"]:
+        """Log-densities of places in the rooms."""
+        x, z = turn_places(place_m, self.quarters).split(1, dim=-1)
+        return self._along_x().log_prob(x) + self._along_z(x[:, 0]).log_prob(z)
+
+    def draw_x(self, uniform: Float[Tensor, "rooms tries 2"]) -> Float[Tensor, "rooms tries"]:
+        """Sample positions along the frames' x axis. `uniform` holds the random numbers to use."""
+        return _sharpened(self._along_x()).drawn(uniform[..., 0], uniform[..., 1:])[..., 0]
+
+    def draw(
+        self, x: Float[Tensor, " rooms"], uniform: Float[Tensor, "rooms 2"]
+    ) -> Float[Tensor, "rooms 2"]:
+        """Sample each place's z in its frame, given its `x` there, and return both turned to the
+        room's axes. `uniform` holds the random numbers to use, uniform in [0, 1)."""
+        z = _sharpened(self._along_z(x)).draw(uniform[:, 0], uniform[:, 1:])[:, 0]
+        return turn_places(torch.stack([x, z], dim=-1), -self.quarters % QUARTERS)
+
+    def _along_x(self) -> LogisticMixture:
+        anchors = self._anchors(0)
+        relations, sides, _ = self._relations(0, anchors.at_m)
+        return self.placement.along_x(self, anchors, (relations,), sides)
+
+    def _along_z(self, x: Float[Tensor, " rooms"]) -> LogisticMixture:
+        anchors = self._anchors(1)
+        relations_x, sides_x, overlap_x = self._relations(0, x.unsqueeze(1))
+        relations_z, sides_z, overlap_z = self._relations(1, anchors.at_m)
+        least = torch.minimum(
+            self.size_m.prod(dim=-1, keepdim=True), self.footprints_m[..., 2:].prod(dim=-1)
+        )
+        shared = overlap_x * overlap_z / least.clamp(min=1e-6).unsqueeze(1)
+        shared = (shared * self.meets.unsqueeze(1)).clamp(max=1).unsqueeze(-1)
+        sides = torch.cat([sides_x.expand_as(sides_z), sides_z], dim=-1)
+        return self.placement.along_z(
+            self, anchors, (relations_x, relations_z, shared.sqrt()), sides
+        )
+
+    def _anchors(self, axis: int) -> Anchors:
+        """The anchors along x (0) or z (1)."""
+        middle, extent = self.rectangle_m[:, axis], self.rectangle_m[:, 2 + axis]
+        size = self.size_m[:, axis]
+        free = ((extent - size) / 2).clamp(min=0)
+        sides = torch.stack([middle - free, middle + free, middle, torch.zeros_like(free)], dim=1)
+        sides = sides.repeat_interleave(2, dim=1)
+        centre, theirs = self.footprints_m[..., axis], self.footprints_m[..., 2 + axis]
+        total, difference = (theirs + size.unsqueeze(1)) / 2, (theirs - size.unsqueeze(1)) / 2
+        away = torch.stack(
+            [-total, -difference, torch.zeros_like(total), difference, total,
+             -total - APART_M, total + APART_M], dim=-1,
+        )  # fmt: skip
+        beside = (centre.unsqueeze(-1) + away).flatten(1)
+        theirs = self.is_object.repeat_interleave(BY_OBJECT, dim=1)
+        kinds = torch.arange(BY_SIDES + BY_OBJECT, device=size.device)
+        return Anchors(
+            torch.cat([sides, beside], dim=1),
+            torch.cat([torch.ones_like(sides, dtype=torch.bool), theirs], dim=1),
+            torch.cat([kinds[:BY_SIDES], kinds[BY_SIDES:].repeat(centre.shape[1])]),
+        )
+
+    def _relations(self, axis: int, at_m: Float[Tensor, "rooms anchors"]) -> tuple[Tensor, ...]:
+        """Features, along an axis, of the relations to the objects already placed and to the sides
+        of the rectangle, and the overlap with each object in metres."""
+        size = self.size_m[:, axis].unsqueeze(1)
+        offset = self.footprints_m[:, None, :, axis] - at_m.unsqueeze(-1)
+        theirs = self.footprints_m[..., 2 + axis]
+        total, difference = ((theirs + size) / 2).unsqueeze(1), ((theirs - size) / 2).unsqueeze(1)
+        gap = offset.abs() - total
+        offsets = torch.stack([offset, offset - difference, offset + difference], dim=-1)
+        relations = [ramps(gap.unsqueeze(-1), GAPS_M), ramps(offsets, OFFSETS_M)]
+        middle, extent = (self.rectangle_m[:, [at]] for at in (axis, 2 + axis))
+        to_middle = at_m - middle
+        sides = (
+            torch.stack([extent / 2 + to_middle, extent / 2 - to_middle], dim=-1)
+            - size[..., None] / 2
+        )
+        overlap = (-gap).clamp(min=0)
+        return torch.cat(relations, dim=-1), ramps(sides, GAPS_M), overlap
+
+
+def _sharpened(mixture: LogisticMixture) -> LogisticMixture:
+    """The mixture that is sampled from; see `SHARPNESS`."""
+    return LogisticMixture(
+        SHARPNESS * mixture.weight_logits, mixture.means, mixture.log_scales + math.log(SPREAD)
+    )
+
+
+class AxisScore(nn.Module):
+    """Weights, shifts and scales of the anchors along an axis.
+
+    The weight logit of an anchor is the output of a small network, which sums over the objects
+    already placed, plus a linear function of the same features, whose coefficients are tables by
+    class and by pair of classes. Within a few steps, the tables learn facts that the network alone
+    would take ten times as long to learn, such as that nightstands stand adjacent to beds.
+    """
+
+    def __init__(self, classes: int, of_object: int, of_sides: int, dropout: float):
+        super().__init__()
+        self.pair_table = nn.Parameter(torch.zeros(classes, classes, of_object))
+        self.side_table = nn.Parameter(torch.zeros(classes, of_sides))
+        self.anchor_table = nn.Parameter(torch.zeros(classes, BY_SIDES + BY_OBJECT))
+        self.relation = nn.Linear(of_object, WIDTH)
+        self.own, self.there = nn.Linear(WIDTH, WIDTH), nn.Linear(WIDTH, WIDTH)
+        self.pooled, self.sides = nn.Linear(WIDTH, WIDTH), nn.Linear(of_sides, WIDTH)
+        self.anchor = nn.Embedding(BY_SIDES + BY_OBJECT, WIDTH)
+        self.anchor_own = nn.Linear(WIDTH, WIDTH)
+        self.dropout = nn.Dropout(dropout)
+        self.out = nn.Linear(WIDTH, 3)
+        scales_m = (
+            [NARROW_M, WIDE_M] * (BY_SIDES // 2) + [NARROW_M] * (BY_OBJECT - 2) + [WIDE_M] * 2
+        )
+        first = torch.tensor([math.log(scale_m / FIRST_SCALE) for scale_m in scales_m])
+        self.first_log_scale: Tensor
+        self.register_buffer("first_log_scale", first, persistent=False)
+        with torch.no_grad():  # so that anchors start near their positions, equally likely
+            self.anchor.weight *= 0.1
+            self.out.weight *= 0.5
+            self.out.bias.zero_()
+
+    def forward(
+        self,
+        places: Places,
+        anchors: Anchors,
+        relations: tuple[Float[Tensor, "rooms #anchors objects _"], ...],
+        sides: Float[Tensor, "rooms anchors features"],
+    ) -> LogisticMixture:
+        """The mixture along the axis of the `anchors`, by the neighbours at each of them.
+
+        Args:
+            relations: Features of the relations to the objects, in several tensors. A tensor that
+                is the same for all anchors has size 1 along that axis, and precedes the others.
+            sides: Features of the relations to the sides of the rectangle.
+        """
+        given = self.own(places.own).unsqueeze(1) + self.there(places.there)
+        # Padding adds relu(-inf) = 0. The tensors of all anchors and objects are so large that each
+        # pass over them takes time, so they are changed in place.
+        given = given.masked_fill(~places.is_object.unsqueeze(-1), -torch.inf).unsqueeze(1)
+        widths = [part.shape[-1] for part in relations]
+        for part, weight in zip(relations, self.relation.weight.split(widths, 1), strict=True):
+            given = (part @ weight.T).add_(given)
+        pairs = given.add_(self.relation.bias).relu_()
+        known = self.sides(sides) + self.anchor(anchors.kind)
+        hidden = (
+            self.pooled(pairs.sum(dim=2) / 2) + known + self.anchor_own(places.own).unsqueeze(1)
+        )
+        logit, shift, scale = self.out(self.dropout(torch.relu(hidden))).unbind(dim=-1)
+        table = self.pair_table[places.label.unsqueeze(1), places.object_class]
+        table = table * places.is_object.unsqueeze(-1)
+        for part, weight in zip(relations, table.split(widths, dim=-1), strict=True):
+            logit = logit + torch.einsum("raof,rof->ra", part, weight)
+        logit = logit + torch.einsum("raf,rf->ra", sides, self.side_table[places.label])
+        logit = logit + self.anchor_table[places.label][:, anchors.kind]
+        means = anchors.at_m + SHIFT_M * shift
+        return LogisticMixture.bounded(
+            logit.masked_fill(~anchors.exists, -torch.inf),
+            means.unsqueeze(-1),
+            (scale + self.first_log_scale[anchors.kind]).unsqueeze(-1),
+        )
 
 
 class Placement(nn.Module):
@@ -87,11 +311,10 @@ class Placement(nn.Module):
         """
         back = side_of(look, backs)
         quarters = -back % QUARTERS
-        before, rectangle_m = into_frames(before, back), turn_rectangles(rectangle_m, quarters)
+        before, rectangle_m = turned_rooms(before, quarters), turn_rectangles(rectangle_m, quarters)
         looks = before.looks
         assert looks is not None
-        own_look = into_frames(_alone(label, look, size_m), back).looks
-        assert own_look is not None
+        own_look = turn_posed(look[:, None], quarters, quarters < 0)[:, 0]
         size_m = torch.where((quarters % 2 == 1)[:, None], size_m.flip(-1), size_m)
         centre, extents = before.boxes_m.split(3, dim=-1)
         bottoms_m = centre[..., 1:2] - extents[..., 1:2] / 2
@@ -101,7 +324,7 @@ class Placement(nn.Module):
             torch.eye(QUARTERS).to(extents)[side_of(looks, backs)], extents, bottoms_m, to_sides,
         ], dim=-1)  # fmt: skip
         own = torch.cat([
-            self.class_embedding(label), self.look_embedding(look_shown[own_look[:, 0]]),
+            self.class_embedding(label), self.look_embedding(look_shown[own_look]),
             size_m, bottom_m.unsqueeze(-1), rectangle_m[:, 2:] / 4, counts,
         ], dim=-1)  # fmt: skip
         own_box = torch.cat([centre.new_zeros(len(label), 3), size_m], dim=-1).unsqueeze(1)
@@ -110,80 +333,8 @@ class Placement(nn.Module):
         level = centre * torch.tensor([0.0, 1.0, 0.0]).to(centre)
         meets = shared_extents(own_box, torch.cat([level, extents], dim=-1))[..., 1] > 0
         return Places(
-            self.along_x, self.along_z, label, before.object_class,
+            self, label, before.object_class,
             self.dropout(torch.relu(self.own(own))), self.dropout(torch.relu(self.there(there))),
             size_m[:, ::2], rectangle_m, before.boxes_m[..., [0, 2, 3, 5]], before.is_object,
             meets, quarters,
         )  # fmt: skip
-
-
-class AxisScore(nn.Module):
-    """Weights, shifts and scales of the anchors along an axis.
-
-    The weight logit of an anchor is the output of a small network, which sums over the objects
-    already placed, plus a linear function of the same features, whose coefficients are tables by
-    class and by pair of classes. Within a few steps, the tables learn facts that the network alone
-    would take ten times as long to learn, such as that nightstands stand adjacent to beds.
-    """
-
-    def __init__(self, classes: int, of_object: int, of_sides: int, dropout: float):
-        super().__init__()
-        self.pair_table = nn.Parameter(torch.zeros(classes, classes, of_object))
-        self.side_table = nn.Parameter(torch.zeros(classes, of_sides))
-        self.anchor_table = nn.Parameter(torch.zeros(classes, BY_SIDES + BY_OBJECT))
-        self.relation = nn.Linear(of_object, WIDTH)
-        self.own, self.there = nn.Linear(WIDTH, WIDTH), nn.Linear(WIDTH, WIDTH)
-        self.pooled, self.sides = nn.Linear(WIDTH, WIDTH), nn.Linear(of_sides, WIDTH)
-        self.anchor = nn.Embedding(BY_SIDES + BY_OBJECT, WIDTH)
-        self.anchor_own = nn.Linear(WIDTH, WIDTH)
-        self.dropout = nn.Dropout(dropout)
-        self.out = nn.Linear(WIDTH, 3)
-        scales_m = (
-            [NARROW_M, WIDE_M] * (BY_SIDES // 2) + [NARROW_M] * (BY_OBJECT - 2) + [WIDE_M] * 2
-        )
-        first = torch.tensor([math.log(scale_m / FIRST_SCALE) for scale_m in scales_m])
-        self.first_log_scale: Tensor
-        self.register_buffer("first_log_scale", first, persistent=False)
-        with torch.no_grad():  # so that anchors start near their positions, equally likely
-            self.anchor.weight *= 0.1
-            self.out.weight *= 0.5
-            self.out.bias.zero_()
-
-    def forward(self, places: Places, anchors: Anchors) -> LogisticMixture:
-        """The mixture along the axis of the `anchors`."""
-        given = self.own(places.own).unsqueeze(1) + self.there(places.there)
-        # Padding adds relu(-inf) = 0. The tensors of all anchors and objects are so large that each
-        # pass over them takes time, so they are changed in place.
-        given = given.masked_fill(~places.is_object.unsqueeze(-1), -torch.inf).unsqueeze(1)
-        widths = [part.shape[-1] for part in anchors.relations]
-        for part, weight in zip(
-            anchors.relations, self.relation.weight.split(widths, 1), strict=True
-        ):
-            given = (part @ weight.T).add_(given)
-        pairs = given.add_(self.relation.bias).relu_()
-        known = self.sides(anchors.sides) + self.anchor(anchors.kind)
-        hidden = (
-            self.pooled(pairs.sum(dim=2) / 2) + known + self.anchor_own(places.own).unsqueeze(1)
-        )
-        logit, shift, scale = self.out(self.dropout(torch.relu(hidden))).unbind(dim=-1)
-        table = self.pair_table[places.label.unsqueeze(1), places.object_class]
-        table = table * places.is_object.unsqueeze(-1)
-        for part, weight in zip(anchors.relations, table.split(widths, dim=-1), strict=True):
-            logit = logit + torch.einsum("raof,rof->ra", part, weight)
-        logit = logit + torch.einsum("raf,rf->ra", anchors.sides, self.side_table[places.label])
-        logit = logit + self.anchor_table[places.label][:, anchors.kind]
-        means = anchors.at_m + SHIFT_M * shift
-        return LogisticMixture.bounded(
-            logit.masked_fill(~anchors.exists, -torch.inf),
-            means.unsqueeze(-1),
-            (scale + self.first_log_scale[anchors.kind]).unsqueeze(-1),
-        )
-
-
-def _alone(
-    label: Int[Tensor, " rooms"], look: Int[Tensor, " rooms"], size_m: Float[Tensor, "rooms 3"]
-) -> PosedRooms:
-    """Rooms with one object each, at the origin."""
-    boxes_m = torch.cat([torch.zeros_like(size_m), size_m], dim=-1).unsqueeze(1)
-    is_object = torch.ones_like(label, dtype=torch.bool).unsqueeze(1)
-    return PosedRooms(label.unsqueeze(1), is_object, boxes_m, looks=look.unsqueeze(1))

@@ -1,5 +1,5 @@
-"""Facts about prototypes from the training rooms: the side of the back and of the front, sizes and
-heights.
+"""Statistics of the training rooms that a sampler is given before it is trained: rectangles, pairs
+of classes that may intersect, and the backs, fronts, sizes and heights of prototypes.
 
 The back of a prototype is the side nearest to the sides of its rooms' rectangles on average. Masks
 do not show the front of a piece of furniture directly. Four cues point to the side opposite to it:
@@ -15,17 +15,21 @@ about the rooms in which its objects were found.
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from sklearn.mixture import GaussianMixture
 from torch import Tensor
 
 from sceneprior.core.boxes import QUARTERS
 from sceneprior.lifted.prototypes import POSES, Prototypes
 from sceneprior.lifted.rooms import PosedRooms
-from sceneprior.lifted.sampler.rooms import (
+from sceneprior.lifted.sampler.contents import END
+from sceneprior.lifted.sampler.frames import (
     gaps_to_sides_m,
     own_sides,
     rectangles_of,
     shared_extents,
 )
+from sceneprior.lifted.sampler.network import RECTANGLES, SIZES, RoomSampler
+from sceneprior.lifted.sampler.rooms import SamplerRooms, frames_of
 
 FURTHEST_M = 1.0
 """Length to which gaps to the sides of the rectangle are clipped before they are averaged."""
@@ -39,8 +43,6 @@ BESIDE = 0.3
 to stand in front of, behind or beside the other."""
 STRIP = 0.2
 """Depth of the strip, as a share of a prototype's extent, whose height is that of a side."""
-SIZES = 32
-"""Maximum number of sizes of a prototype; the most frequent ones are kept."""
 SAME_SIZE = 0.13
 """Largest difference between the log extents of two objects of one entry, along any axis. The value
 gives the val rooms' sizes the highest likelihood
@@ -48,13 +50,46 @@ gives the val rooms' sizes the highest likelihood
 COMMON = 2
 """Number of objects that an entry must have, unless no entry of its prototype has as many. An
 unusual size is more often an error of lifting than truly rare."""
+FRAMES = 8
+"""Noisy rectangles per training room to which the mixture is fitted."""
+LEAST_VARIANCE = 0.01
+"""Added to the variances of the mixture of rectangles: 10 cm squared, or a tenth of an extent
+squared."""
 
 
-def gaps_by_side(rooms: PosedRooms) -> Float[Tensor, "rooms objects 4"]:
-    """Gaps in metres from each object to the four sides of its room's rectangle: low z, low x, high
-    z, high x."""
-    low, high = gaps_to_sides_m(rooms.boxes_m, rectangles_of(rooms))
-    return torch.stack([low[..., 1], low[..., 0], high[..., 1], high[..., 0]], dim=-1)
+def teach(sampler: RoomSampler, rooms: SamplerRooms) -> None:
+    """Set the buffers of a fresh sampler from the training rooms: the encodings of looks, the
+    mixture of rectangles, the classes that may be sampled, the pairs of classes that may intersect,
+    mean footprints, and the sizes, heights, backs and fronts of prototypes."""
+    prototypes = rooms.prototypes
+    looks = torch.from_numpy(prototypes.shown())
+    sampler.look_shown[: len(looks)] = looks
+    labels = torch.from_numpy(prototypes.object_class)
+    sampler.look_class[: len(looks)] = labels.repeat_interleave(POSES)
+    sampler.contents.known[labels[labels >= 0]] = True
+    sampler.contents.known[END] = True
+    sampler.may_meet.copy_(rooms.may_meet(len(sampler.may_meet)))
+    here = rooms.rooms.is_object
+    areas_m2 = rooms.rooms.boxes_m[here][:, [3, 5]].prod(dim=-1)
+    labels = rooms.rooms.object_class[here]
+    sampler.footprints_m2.scatter_reduce_(0, labels, areas_m2, "mean", include_self=False)
+    names = ("backs", "fronts", "front_confidence", "sizes_m", "bottoms_m", "size_counts")
+    found = (*find_sides(rooms.rooms, prototypes), *find_sizes(rooms.rooms, prototypes))
+    for name, values in zip(names, found, strict=True):
+        getattr(sampler, name)[: len(values)] = values
+    generator = torch.Generator().manual_seed(0)
+    furnished = here.any(dim=1)
+    frames = torch.cat([frames_of(rooms.rooms, generator) for _ in range(FRAMES)])
+    centre, extents = frames[furnished.repeat(FRAMES)].split(2, dim=-1)
+    mixture = GaussianMixture(RECTANGLES, reg_covar=LEAST_VARIANCE, random_state=0).fit(
+        torch.cat([centre, extents.log()], dim=-1).numpy()
+    )
+    for buffer, values in (
+        (sampler.rectangle_logits, np.log(mixture.weights_)),
+        (sampler.rectangle_means, mixture.means_),
+        (sampler.rectangle_factors, np.linalg.cholesky(mixture.covariances_)),
+    ):
+        buffer.copy_(torch.from_numpy(values))
 
 
 def mean_by_prototype(
@@ -68,33 +103,29 @@ def mean_by_prototype(
     return total / number.clamp(min=1).unsqueeze(-1), number > 0
 
 
-def find_backs(rooms: PosedRooms, prototypes: int) -> Int[Tensor, " prototypes"]:
-    """The side of each prototype, in pose 0, with the smallest mean gap to the sides of its rooms'
-    rectangles; 0 for unused prototypes."""
-    assert rooms.looks is not None
-    gaps_m = gaps_by_side(rooms).clamp(max=FURTHEST_M).gather(-1, own_sides(rooms.looks))
-    return mean_by_prototype(gaps_m, rooms, prototypes)[0].argmin(dim=1)
+def find_sides(
+    rooms: PosedRooms, prototypes: Prototypes
+) -> tuple[Int[Tensor, " prototypes"], Int[Tensor, " prototypes"], Float[Tensor, " prototypes"]]:
+    """The sides of each prototype's back and of its front in pose 0, and the front's confidence.
 
-
-def find_fronts(
-    rooms: PosedRooms, prototypes: Prototypes, count: int
-) -> tuple[Int[Tensor, " count"], Float[Tensor, " count"]]:
-    """The side to which each prototype's front points in pose 0, with a confidence.
+    The back is the side with the smallest mean gap to the sides of its rooms' rectangles; the front
+    is opposite to the side that all cues (`WEIGHTS`) point to.
 
     Args:
         rooms: Furnished rooms with looks.
         prototypes: The prototypes of these looks.
-        count: Length of the result, at least the number of prototypes; the rest is 0.
 
     Returns:
-        Sides 0 to 3 for low z, low x, high z and high x; probabilities of these, at least 1/4 for
-        prototypes that occur and 0 for others, calibrated on the rooms of `WEIGHTS`.
+        Sides 0 to 3 for low z, low x, high z and high x, 0 for the back of a prototype that does
+        not occur; probabilities of the fronts, at least 1/4 for prototypes that occur and 0 for
+        others, calibrated on the rooms of `WEIGHTS`.
     """
     assert rooms.looks is not None
-    sides = own_sides(rooms.looks)
-    to_walls = gaps_by_side(rooms).clamp(max=FURTHEST_M).gather(-1, sides)
+    sides, used = own_sides(rooms.looks), len(prototypes.parts)
+    low, high = gaps_to_sides_m(rooms.boxes_m, rectangles_of(rooms))
+    to_walls = torch.stack([low[..., 1], low[..., 0], high[..., 1], high[..., 0]], dim=-1)
+    to_walls = to_walls.clamp(max=FURTHEST_M).gather(-1, sides)
     to_others = _gaps_to_furniture(rooms).gather(-1, sides)
-    used = len(prototypes.parts)
     wall, occurs = mean_by_prototype(to_walls, rooms, used)
     furniture, _ = mean_by_prototype(to_others, rooms, used)
     along = np.log(prototypes.sizes_m[:, [0, 2, 0, 2]])
@@ -104,16 +135,13 @@ def find_fronts(
         "width": torch.from_numpy(along - along.mean(axis=1, keepdims=True)),
     }  # fmt: skip
     logits = torch.stack([weight * cues[name].double() for name, weight in WEIGHTS.items()]).sum(0)
-    confidence, back = logits.softmax(dim=1).max(dim=1)
-    fronts, sure = torch.zeros(count, dtype=torch.int64), torch.zeros(count)
-    fronts[:used] = (back + QUARTERS // 2) % QUARTERS
-    sure[:used] = confidence.float() * occurs
-    return fronts, sure
+    confidence, behind = logits.softmax(dim=1).max(dim=1)
+    return wall.argmin(dim=1), (behind + QUARTERS // 2) % QUARTERS, confidence.float() * occurs
 
 
 def _gaps_to_furniture(rooms: PosedRooms) -> Float[Tensor, "rooms objects 4"]:
     """Gap in metres from each side of each object to the nearest object on that side, at most
-    `FURTHEST_M`; sides in the order of `gaps_by_side`."""
+    `FURTHEST_M`; sides in the order low z, low x, high z, high x."""
     boxes_m, here = rooms.boxes_m, rooms.is_object
     one, other = boxes_m.unsqueeze(2), boxes_m.unsqueeze(1)
     shared = shared_extents(one, other)
@@ -151,10 +179,8 @@ def _heights(grids: Bool[np.ndarray, "prototypes x y z"]) -> Float[np.ndarray, "
 
 
 def find_sizes(
-    rooms: PosedRooms, prototypes: Prototypes, count: int
-) -> tuple[
-    Float[Tensor, "count sizes 3"], Float[Tensor, "count sizes"], Float[Tensor, "count sizes"]
-]:
+    rooms: PosedRooms, prototypes: Prototypes
+) -> tuple[Float[Tensor, "used sizes 3"], Float[Tensor, "used sizes"], Float[Tensor, "used sizes"]]:
     """Extents of the entries of each prototype, in pose 0, heights of their bottoms, at least 0,
     both in metres, and their numbers of objects.
 
@@ -165,7 +191,6 @@ def find_sizes(
     Args:
         rooms: Furnished rooms with looks.
         prototypes: The prototypes of these looks.
-        count: Length of the result, at least the number of prototypes.
     """
     from scipy.cluster.hierarchy import fcluster, linkage  # imported here: training only
 
@@ -175,24 +200,22 @@ def find_sizes(
     heights_m = (centers_m - objects_m / 2)[:, 1].clamp(min=0).numpy()
     # Odd poses are turned by a quarter or three, which swaps x and z.
     objects_m = np.where(looks[:, None] % 2 == 1, objects_m.numpy()[:, ::-1], objects_m)
+    count = len(prototypes.object_class)
     found_m = torch.ones(count, SIZES, 3)
     bottoms_m, numbers = torch.zeros(2, count, SIZES)
     for row in np.flatnonzero(prototypes.object_class >= 0):
         own = looks // POSES == row
         own_m, own_bottoms_m = objects_m[own], heights_m[own]
-        if len(own_m) < 2:
-            if not len(own_m):
-                own_m, own_bottoms_m = prototypes.sizes_m[row, None], np.zeros(1)
-            entry = np.zeros(1, dtype=int)
-        else:
+        if not len(own_m):
+            own_m, own_bottoms_m = prototypes.sizes_m[row, None], np.zeros(1)
+        entry = np.zeros(1, dtype=int)
+        if len(own_m) > 1:
             joined = linkage(np.log(own_m), "complete", "chebyshev")
             entry = fcluster(joined, SAME_SIZE, "distance") - 1
         number = np.bincount(entry)
         kept = np.argsort(-number, kind="stable")[:SIZES]
-        kept = kept[number[kept] >= min(COMMON, number.max())]
-        medians_m = [np.median(own_m[entry == each], axis=0) for each in kept]
-        found_m[row, : len(kept)] = torch.from_numpy(np.stack(medians_m))
-        for column, each in enumerate(kept):
+        for column, each in enumerate(kept[number[kept] >= min(COMMON, number.max())]):
+            found_m[row, column] = torch.from_numpy(np.median(own_m[entry == each], axis=0))
             bottoms_m[row, column] = float(np.median(own_bottoms_m[entry == each]))
-        numbers[row, : len(kept)] = torch.from_numpy(number[kept])
+            numbers[row, column] = int(number[each])
     return found_m, bottoms_m, numbers

@@ -6,27 +6,15 @@ from dataclasses import replace
 from typing import Any
 
 import lightning
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
-from sklearn.mixture import GaussianMixture
 from torch import Tensor, nn
 
-from sceneprior.lifted.prototypes import POSES
 from sceneprior.lifted.rooms import PosedRooms
-from sceneprior.lifted.sampler.contents import END
-from sceneprior.lifted.sampler.encoder_state import Frame
-from sceneprior.lifted.sampler.network import RECTANGLES, RoomSampler, SamplerConfig
-from sceneprior.lifted.sampler.prototype_statistics import find_backs, find_fronts, find_sizes
-from sceneprior.lifted.sampler.rooms import (
-    SYMMETRIES,
-    SamplerRooms,
-    frames_of,
-    large_first,
-    shuffled,
-    turned_rooms,
-)
+from sceneprior.lifted.sampler.frames import SYMMETRIES, turned_rooms
+from sceneprior.lifted.sampler.network import RoomSampler, SamplerConfig
+from sceneprior.lifted.sampler.rooms import SamplerRooms, frames_of, large_first, shuffled
 from sceneprior.paper.losses import share_of_batch
 from sceneprior.paper.prior import ScenePrior
 from sceneprior.training.steps import (
@@ -48,11 +36,6 @@ CONTENTS_RATE = 5.0
 """Learning rate of `Contents` relative to that of the rest. `Contents` is small and independent of
 the rest, and has few examples to learn from: only one bedroom in thirty shows that a bedroom may
 lack a bed."""
-FRAMES = 8
-"""Noisy rectangles per training room to which the mixture is fitted."""
-LEAST_VARIANCE = 0.01
-"""Added to the variances of the mixture of rectangles: 10 cm squared, or a tenth of an extent
-squared."""
 
 PARTS_OF_OBJECT = ("look", "size", "place")
 """Parts of an object's likelihood given its class."""
@@ -151,46 +134,6 @@ class SamplerStage(lightning.LightningModule):
         return with_cosine(optimizer, int(self.trainer.estimated_stepping_batches))
 
 
-def teach(sampler: RoomSampler, rooms: SamplerRooms) -> None:
-    """Set the buffers of a fresh sampler from the training rooms: the encodings of looks, the
-    mixture of rectangles, the classes that may be sampled, the pairs of classes that may intersect,
-    mean footprints, and the sizes, heights, backs and fronts of prototypes."""
-    prototypes = rooms.prototypes
-    looks = torch.from_numpy(prototypes.shown())
-    sampler.look_shown[: len(looks)] = looks
-    labels = torch.from_numpy(prototypes.object_class)
-    sampler.look_class[: len(looks)] = labels.repeat_interleave(POSES)
-    sampler.contents.known[labels[labels >= 0]] = True
-    sampler.contents.known[END] = True
-    sampler.may_meet.copy_(rooms.may_meet(len(sampler.may_meet)))
-    here = rooms.rooms.is_object
-    areas_m2 = rooms.rooms.boxes_m[here][:, [3, 5]].prod(dim=-1)
-    labels = rooms.rooms.object_class[here]
-    sampler.footprints_m2.scatter_reduce_(0, labels, areas_m2, "mean", include_self=False)
-    found = find_sizes(rooms.rooms, prototypes, len(sampler.backs))
-    for buffer, entries in zip(
-        (sampler.sizes_m, sampler.bottoms_m, sampler.size_counts), found, strict=True
-    ):
-        buffer.copy_(entries)
-    sampler.backs.copy_(find_backs(rooms.rooms, len(sampler.backs)))
-    fronts, confidence = find_fronts(rooms.rooms, prototypes, len(sampler.fronts))
-    sampler.fronts.copy_(fronts)
-    sampler.front_confidence.copy_(confidence)
-    generator = torch.Generator().manual_seed(0)
-    furnished = here.any(dim=1)
-    frames = torch.cat([frames_of(rooms.rooms, generator) for _ in range(FRAMES)])
-    centre, extents = frames[furnished.repeat(FRAMES)].split(2, dim=-1)
-    mixture = GaussianMixture(RECTANGLES, reg_covar=LEAST_VARIANCE, random_state=0).fit(
-        torch.cat([centre, extents.log()], dim=-1).numpy()
-    )
-    for buffer, values in (
-        (sampler.rectangle_logits, np.log(mixture.weights_)),
-        (sampler.rectangle_means, mixture.means_),
-        (sampler.rectangle_factors, np.linalg.cholesky(mixture.covariances_)),
-    ):
-        buffer.copy_(torch.from_numpy(values))
-
-
 def negative_log_likelihood(
     sampler: RoomSampler,
     rooms: PosedRooms,
@@ -209,9 +152,9 @@ def negative_log_likelihood(
     listed = shuffled(rooms, generator)
     uniform = torch.rand(rooms.is_object.shape, generator=generator).to(rooms.boxes_m)
     rooms = rooms.take(large_first(rooms.object_class, sampler.footprints_m2, uniform))
-    frame = Frame(frames_of(rooms, generator), symmetry)
+    rectangle_m = frames_of(rooms, generator)
     rooms = replace(rooms, walls_m=None)
-    tokens = sampler.tokens(rooms, frame.rectangle_m)
+    tokens = sampler.tokens(rooms, rectangle_m)
     counts = rooms.is_object.sum(dim=1)
     there = sampler.contents.before(rooms.object_class, rooms.is_object)
     still = there[:, -1:] - there
@@ -222,14 +165,16 @@ def negative_log_likelihood(
     for step in range(max(int(counts.max()), 1)):
         row = (counts.clamp(min=1) > step).nonzero()[:, 0]
         before = _first(rooms, row, step)
-        state = sampler.read(before, still[row, step], frame.rows(row), tokens[row, :step])
+        state = sampler.read(
+            before, still[row, step], rectangle_m[row], symmetry[row], tokens[row, :step]
+        )
         going = (counts[row] > step).nonzero()[:, 0]
         row = row[going]
         following = _first(rooms, row, step + 1).take(torch.full((len(row), 1), step).to(row))
         for name, log_prob in sampler.log_prob(state.rows(going), following).items():
             found[name] = found[name].index_add(0, row, -log_prob)
     listing = sampler.contents.negative_log_likelihood(
-        listed.object_class, listed.is_object, frame.rectangle_m[:, 2:]
+        listed.object_class, listed.is_object, rectangle_m[:, 2:]
     )
     return {"class": listing, **found}
 

@@ -14,7 +14,7 @@ from sceneprior.lifted.requests.floors import Floor, read_floor
 from sceneprior.lifted.requests.request import Conditions
 from sceneprior.lifted.requests.wishes import CountWish, Wishes
 from sceneprior.lifted.rooms import PosedRooms
-from sceneprior.lifted.sampler.rooms import gaps_m, rectangles_of, shared_extents
+from sceneprior.lifted.sampler.frames import gaps_m, rectangles_of, shared_extents
 
 CLASSES = ("void", "sofa", "box", "lamp", "piano")
 SOFA = SceneObject("sofa", (0.3, 0.4, -0.2), (1.4, 0.8, 2.0))

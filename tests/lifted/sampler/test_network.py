@@ -12,15 +12,8 @@ from sceneprior.core.boxes import QUARTERS
 from sceneprior.lifted.prototypes import turn_posed
 from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.contents import END
-from sceneprior.lifted.sampler.encoder_state import Frame
-from sceneprior.lifted.sampler.rooms import (
-    SYMMETRIES,
-    SamplerRooms,
-    frames_of,
-    large_first,
-    rectangles_of,
-    shuffled,
-)
+from sceneprior.lifted.sampler.frames import SYMMETRIES, rectangles_of
+from sceneprior.lifted.sampler.rooms import SamplerRooms, frames_of, large_first, shuffled
 from sceneprior.lifted.sampler.stage import negative_log_likelihood
 
 
@@ -45,8 +38,9 @@ def as_they_are(rooms: PosedRooms) -> torch.Tensor:
 def read(sampler, rooms: PosedRooms, rectangle_m: torch.Tensor, coming=None, symmetry=None):
     if coming is None:
         coming = torch.zeros(len(rooms.boxes_m), len(sampler.may_meet)).double()
-    frame = Frame(rectangle_m, as_they_are(rooms) if symmetry is None else symmetry)
-    return sampler.read(rooms, coming, frame, sampler.tokens(rooms, rectangle_m))
+    if symmetry is None:
+        symmetry = as_they_are(rooms)
+    return sampler.read(rooms, coming, rectangle_m, symmetry, sampler.tokens(rooms, rectangle_m))
 
 
 def test_order_and_padding_change_nothing(sampler, rooms):
@@ -94,15 +88,6 @@ def test_likelihoods_are_those_of_one_object_after_the_other(sampler, rooms):
             assert value == pytest.approx(float(fast[name][row]), rel=1e-9), name
 
 
-def test_rooms_without_objects_hold_nothing_and_are_likely_for_it(sampler, rooms):
-    nothing = in_float64(rooms.rooms).only(torch.zeros(len(rooms), 1).bool())
-    found = negative_log_likelihood(
-        sampler, nothing, as_they_are(nothing), torch.Generator().manual_seed(0)
-    )
-    assert (found["class"] > 0).all()
-    assert not any(found[name].any() for name in ("look", "size", "place"))
-
-
 def test_how_often_a_look_comes_turns_with_the_room(sampler, rooms):
     """A look that is likely in a room as it is, is as likely turned where the room is turned."""
     whole = in_float64(rooms.rooms).changed(lambda part: part[:1])
@@ -115,7 +100,7 @@ def test_how_often_a_look_comes_turns_with_the_room(sampler, rooms):
     try:
         for number in range(SYMMETRIES):
             shown = torch.tensor([number])
-            reading = plain._replace(frame=Frame(frame, shown))
+            reading = plain._replace(symmetry=shown)
             gain = sampler.look_logits(reading, label) - before
             at = turn_posed(torch.tensor([[2]]), shown % QUARTERS, shown >= QUARTERS)
             likelier = (gain > 1.5) & before.isfinite()

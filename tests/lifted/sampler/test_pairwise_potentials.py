@@ -9,10 +9,8 @@ from torch.testing import assert_close
 from sceneprior.core.boxes import QUARTERS
 from sceneprior.lifted.prototypes import POSES, turn_posed
 from sceneprior.lifted.rooms import PosedRooms
-from sceneprior.lifted.sampler.contents import MANY
-from sceneprior.lifted.sampler.frames import side_of
-from sceneprior.lifted.sampler.pairwise_potentials import MOST_LOG, PairwisePotentials
-from sceneprior.lifted.sampler.rooms import SYMMETRIES, turned_rooms
+from sceneprior.lifted.sampler.contents import MANY, MOST_LOG, PairwisePotentials
+from sceneprior.lifted.sampler.frames import SYMMETRIES, side_of, turned_rooms
 
 CLASSES, PROTOTYPES = 4, 3
 LOOKS = PROTOTYPES * POSES

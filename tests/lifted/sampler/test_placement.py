@@ -7,16 +7,9 @@ from torch.testing import assert_close
 from sceneprior.core.boxes import QUARTERS, turn_boxes
 from sceneprior.lifted.prototypes import POSES, turn_posed
 from sceneprior.lifted.rooms import PosedRooms
-from sceneprior.lifted.sampler import places as module
-from sceneprior.lifted.sampler.frames import (
-    into_frames,
-    side_of,
-    turn_places,
-    turn_rectangles,
-)
-from sceneprior.lifted.sampler.placement import Placement
-from sceneprior.lifted.sampler.places import Places, ramps
-from sceneprior.lifted.sampler.prototype_statistics import find_backs
+from sceneprior.lifted.sampler import placement as module
+from sceneprior.lifted.sampler.frames import turn_places, turn_rectangles
+from sceneprior.lifted.sampler.placement import Placement, Places
 
 CLASSES, LOOKS = 4, 3 * POSES
 
@@ -109,23 +102,23 @@ def test_scores_are_those_of_plain_layers_on_joined_features(placement, given, a
     score = placement.along_x if axis == "x" else placement.along_z
     calls = []
 
-    def watched(places, anchors):
-        calls.append((places, anchors, score(places, anchors)))
-        return calls[-1][2]
+    def watched(_, given, found):
+        calls.append((*given, found))
 
-    places = distribution(placement, *given)._replace(**{f"along_{axis}": watched})
-    places.log_prob(torch.rand(3, 2).double())
-    (places, anchors, found), real = calls[0], places.is_object[:, None, :, None]
+    places = distribution(placement, *given)
+    with score.register_forward_hook(watched):
+        places.log_prob(torch.rand(3, 2).double())
+    (places, anchors, relations, sides, found), real = calls[0], places.is_object[:, None, :, None]
     number = anchors.at_m.shape[1]
-    joined = torch.cat([part.expand(-1, number, -1, -1) for part in anchors.relations], dim=-1)
+    joined = torch.cat([part.expand(-1, number, -1, -1) for part in relations], dim=-1)
     met = score.own(places.own).unsqueeze(1) + score.there(places.there)
     pooled = (torch.relu(score.relation(joined) + met.unsqueeze(1)) * real).sum(dim=2) / 2
-    hidden = score.pooled(pooled) + score.sides(anchors.sides) + score.anchor(anchors.kind)
+    hidden = score.pooled(pooled) + score.sides(sides) + score.anchor(anchors.kind)
     hidden = hidden + score.anchor_own(places.own).unsqueeze(1)
     logit, shift, _ = score.out(torch.relu(hidden)).unbind(dim=-1)
     pairs = score.pair_table[places.label[:, None], places.object_class].unsqueeze(1)
     logit = logit + (joined * pairs * real).sum(dim=(2, 3))
-    logit = logit + (anchors.sides * score.side_table[places.label].unsqueeze(1)).sum(dim=-1)
+    logit = logit + (sides * score.side_table[places.label].unsqueeze(1)).sum(dim=-1)
     logit = logit + score.anchor_table[places.label][:, anchors.kind]
     assert_close(found.weight_logits, logit.masked_fill(~anchors.exists, -torch.inf))
     assert_close(found.means[..., 0], anchors.at_m + 0.3 * shift)
@@ -161,31 +154,3 @@ def test_draws_follow_the_density(placement, given, monkeypatch):
     assert float(drawn.mean()) == pytest.approx(
         wanted, abs=4 * float(drawn.std()) / len(drawn) ** 0.5 + 0.02
     )
-
-
-def test_the_back_is_the_side_at_the_wall():
-    """The same prototype before four walls, in the poses that face the room; the bed that is
-    mirrored has its back at the other side along x."""
-    box = torch.tensor([[[-2.0, 0.5, 0.5, 1.0, 1.0, 1.0], [0.0, 0.1, 0.0, 5.0, 0.2, 5.0]]])
-    here = torch.tensor([[True, True]])
-    plain = PosedRooms(torch.tensor([[1, 2]]), here, box, looks=torch.tensor([[8, 0]]))
-    quarters = torch.arange(QUARTERS).repeat(2)
-    mirrored = torch.arange(2 * QUARTERS) >= QUARTERS
-    many = plain.changed(lambda part: part.repeat(2 * QUARTERS, *[1] * (part.ndim - 1)))
-    assert many.looks is not None
-    rooms = PosedRooms(
-        many.object_class, many.is_object, turn_boxes(many.boxes_m, quarters, mirrored),
-        looks=turn_posed(many.looks, quarters, mirrored),
-    )  # fmt: skip
-    backs = find_backs(rooms, 2)
-    assert backs.tolist() == [0, 1]  # the rug in the middle is at no side; the first counts
-    assert rooms.looks is not None
-    back = side_of(rooms.looks[:, 0], backs)
-    turned = into_frames(rooms, back)
-    assert_close(turned.boxes_m[:, 0, 2], torch.full((8,), -2.0))
-
-
-def test_ramps_are_piecewise_linear():
-    lengths = torch.tensor([-1.0, 0.25, 1.5, 9.0])
-    expected = [[0, 0], [0.25, 0], [1, 0.25], [1, 1]]
-    assert torch.stack([ramps(one[None], (0.0, 1.0, 3.0)) for one in lengths]).tolist() == expected

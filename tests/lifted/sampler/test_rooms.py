@@ -13,16 +13,14 @@ from sceneprior.core.boxes import turn_boxes
 from sceneprior.core.wall_lines import Wall
 from sceneprior.lifted.lifting.dataset import LiftedDataset
 from sceneprior.lifted.rooms import PosedRooms
-from sceneprior.lifted.sampler.rooms import (
+from sceneprior.lifted.sampler.frames import (
     FRAME_M,
     SYMMETRIES,
-    SamplerRooms,
-    frames_of,
     rectangle_sides,
     rectangles_of,
-    shuffled,
     turned_rooms,
 )
+from sceneprior.lifted.sampler.rooms import SamplerRooms, frames_of, shuffled
 
 
 @pytest.fixture(scope="module")

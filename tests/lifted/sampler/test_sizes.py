@@ -6,12 +6,13 @@ from itertools import combinations
 import numpy as np
 import pytest
 import torch
-from rooms_of_boxes import PROTOTYPES, sampler_rooms
+from rooms_of_boxes import sampler_rooms
 from torch.testing import assert_close
 
 from sceneprior.lifted.prototypes import POSES
-from sceneprior.lifted.sampler.prototype_statistics import COMMON, SAME_SIZE, SIZES, find_sizes
-from sceneprior.lifted.sampler.rooms import SamplerRooms, turned_rooms
+from sceneprior.lifted.sampler.frames import turned_rooms
+from sceneprior.lifted.sampler.prototype_statistics import COMMON, SAME_SIZE, find_sizes
+from sceneprior.lifted.sampler.rooms import SamplerRooms
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +45,7 @@ def complete_linkage(own_m: list[np.ndarray]) -> list[list[np.ndarray]]:
 
 
 def test_entries_are_those_of_a_plain_loop(rooms):
-    found_m, bottoms_m, numbers = find_sizes(rooms.rooms, rooms.prototypes, PROTOTYPES)
+    found_m, bottoms_m, numbers = find_sizes(rooms.rooms, rooms.prototypes)
     own: dict[int, list[np.ndarray]] = {}
     heights_m: dict[tuple, float] = {}
     for room, item in rooms.rooms.is_object.nonzero().tolist():
@@ -73,22 +74,21 @@ def test_entries_are_those_of_a_plain_loop(rooms):
 
 
 def test_a_room_turned_or_mirrored_teaches_the_same_sizes(rooms):
-    plain = find_sizes(rooms.rooms, rooms.prototypes, PROTOTYPES)
+    plain = find_sizes(rooms.rooms, rooms.prototypes)
     turned = turned_rooms(rooms.rooms, torch.arange(len(rooms)) % 8)
-    for one, other in zip(plain, find_sizes(turned, rooms.prototypes, PROTOTYPES), strict=True):
+    for one, other in zip(plain, find_sizes(turned, rooms.prototypes), strict=True):
         assert_close(one, other)
 
 
 def test_a_prototype_with_one_object_or_none_has_one_size():
     rooms = sampler_rooms()
     alone = rooms.rooms.only(torch.arange(len(rooms))[:, None] == 1)
-    found_m, _, numbers = find_sizes(alone, rooms.prototypes, PROTOTYPES)
+    found_m, _, numbers = find_sizes(alone, rooms.prototypes)
     none = rooms.rooms.only(torch.zeros(len(rooms), 1, dtype=torch.bool))
-    own_m, floor_m, ones = find_sizes(none, rooms.prototypes, PROTOTYPES)
-    used = len(rooms.prototypes.sizes_m)
-    assert_close(own_m[:used, 0], torch.from_numpy(rooms.prototypes.sizes_m).float())
-    wanted = torch.zeros(PROTOTYPES, SIZES)
-    wanted[:used, 0] = 1
+    own_m, floor_m, ones = find_sizes(none, rooms.prototypes)
+    assert_close(own_m[:, 0], torch.from_numpy(rooms.prototypes.sizes_m).float())
+    wanted = torch.zeros_like(ones)
+    wanted[:, 0] = 1
     assert not floor_m.any() and torch.equal(ones, wanted) and torch.equal(numbers, wanted)
     first = int(alone.looks[1, 0])
     assert_close(found_m[first // POSES, 0].sort().values, alone.boxes_m[1, 0, 3:].sort().values)

@@ -11,8 +11,9 @@ from torch import nn
 
 from sceneprior.apps.config import load_any_run
 from sceneprior.core.errors import ConfigError
+from sceneprior.lifted.sampler.frames import rectangles_of
 from sceneprior.lifted.sampler.network import SamplerConfig
-from sceneprior.lifted.sampler.rooms import SamplerRooms, rectangles_of
+from sceneprior.lifted.sampler.rooms import SamplerRooms
 from sceneprior.lifted.sampler.stage import SamplerStage, negative_log_likelihood
 from sceneprior.training.fit import fit
 from sceneprior.training.steps import make_loader
