@@ -89,7 +89,7 @@ OWNERS = {
         "sceneprior/paper/matching.py",
         "sceneprior/evaluation/", "data_prep/inspection/causes.py",
     ],
-    "cv2": ["data_prep/readers/posed/lens.py", "sceneprior/evaluation/metrics/"],
+    "cv2": ["data_prep/readers/posed/cameras.py", "sceneprior/evaluation/metrics/"],
     "viser": ["sceneprior/apps/viewer/"],
     "mujoco": ["sceneprior/evaluation/metrics/stability.py"],
     "coacd": ["sceneprior/core/colliders.py"],

@@ -26,8 +26,8 @@ from data_prep.engine.plan import digest
 from data_prep.engine.source import RoomTask
 from data_prep.readers.annotations import LABEL_SET, LIKE_NYU40, TABLE, Labels, read_labels
 from data_prep.readers.frames import GL_TO_CV, Y_UP, chosen_frames, shrunk
-from data_prep.readers.posed.colmap import read_model
-from data_prep.readers.posed.recording import PosedFrame, PosedPicture, frame_intrinsics
+from data_prep.readers.posed.captures import read_model
+from data_prep.readers.posed.recording import PosedFrame, frame_intrinsics
 from data_prep.readers.posed.transforms import FILE_NAME, read_recording
 from data_prep.readers.reader import FoundRoom, Reader
 from data_prep.readers.rooms import FramedRoom, numbered
@@ -134,7 +134,7 @@ def _cameras(scene: Path) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
         model = [scene / device / "colmap" / f"{name}.txt" for name in ("cameras", "images")]
         poses_path = scene / device / "nerfstudio" / FILE_NAME
         if all(path.is_file() for path in model):
-            return _in_mesh(model[1], np.eye(4), read_model(*model))
+            return _in_mesh(model[1], np.eye(4), read_model(model))
         if poses_path.is_file():
             frames = read_recording(poses_path.parent).frames
             return _in_mesh(poses_path, _FROM_NERFSTUDIO, frames)
@@ -157,7 +157,7 @@ def _cameras(scene: Path) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
 
 
 def _in_mesh(
-    path: Path, mesh_from_world: np.ndarray, images: Sequence[PosedPicture | PosedFrame]
+    path: Path, mesh_from_world: np.ndarray, images: Sequence[PosedFrame]
 ) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
     """Result of `_cameras`, from the pictures of a file."""
     lenses, size = [], (0, 0)

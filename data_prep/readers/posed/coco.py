@@ -1,93 +1,37 @@
-"""Masks as polygons or run lengths in COCO's JSON: of images, of images with tracks, of videos.
+"""Masks in COCO's formats: polygons or run lengths of images, of images with tracks or of videos;
+and panoptic PNGs, whose colours are the ids of segments.
 
 Source: cocodataset.org (data format); the format of YouTube-VIS, whose annotations have one mask
-per frame in `segmentations`; CocoVID and CVAT, whose annotations of images have a track. The JSON
-that a demo of Grounded-SAM-2 writes for each picture: `grounded_sam2_local_demo.py` in
-IDEA-Research/Grounded-SAM-2.
+per frame in `segmentations`; CocoVID and CVAT, whose annotations of images have a track.
 """
 
-from abc import abstractmethod
-from dataclasses import dataclass, field
+from collections.abc import Iterator
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, ConfigDict, Field
 
-from data_prep.readers.posed.masks import FrameMask, MaskFormat, instead, main_classes
-from data_prep.readers.posed.recording import PosedFrame
-from data_prep.readers.posed.sam2 import LABELS, MASKS, PREFIX, GroundedSam2
-from sceneprior.core.checked import checked, shown
-from sceneprior.core.coco import (
-    CROWD,
-    Category,
-    CocoId,
-    Side,
-    check_size,
-    decode,
-    paint,
-    read_coco_json,
+from data_prep.readers.posed.masks import (
+    PANOPTIC,
+    FrameMask,
+    FramePngs,
+    MaskFormat,
+    SegmentedFrame,
+    find_table,
 )
+from data_prep.readers.posed.recording import INSTANCES
+from sceneprior.core.checked import checked, shown
+from sceneprior.core.classes import STUFF, label_set
+from sceneprior.core.coco import CROWD, Category, CocoId, Side, read_coco_json
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
-from sceneprior.core.id_tables import LARGEST_ID
+from sceneprior.core.id_tables import LARGEST_ID, mask_size, read_rgb, stuff_of, tidy
 
 FILES = ("*coco*.json", "instances*.json", "annotations*.json", "annotations/*.json")
 """Glob patterns of COCO's JSON in a room's folder."""
-
-
-@dataclass
-class SegmentedFrame:
-    """Masks of one frame as polygons or run lengths, which are decoded when the frame is read."""
-
-    size: tuple[int, int]
-    where: str
-    """File and frame, for messages."""
-    masks: list[tuple[int, Any, str]] = field(default_factory=list)
-    """Id, segmentation and place of each mask."""
-    classes: dict[int, str] = field(default_factory=dict)
-
-    def add(self, number: int, name: str, segmentation: Any, where: str) -> None:
-        """Add a mask; `where` names it within the frame."""
-        self.masks.append((number, segmentation, f"{self.where}, {where}"))
-        self.classes[number] = name
-
-    def read(self) -> np.ndarray:
-        """Ids, (height, width)."""
-        masks = ((k, decode(mask, self.size, where)) for k, mask, where in self.masks)
-        return paint(masks, self.size)
-
-
-class SegmentedFrames(MaskFormat):
-    """Masks as polygons or run lengths. Masks of one frame may overlap (`paint`)."""
-
-    @property
-    @abstractmethod
-    def frames(self) -> dict[str, SegmentedFrame]:
-        """Frames by the stems of their pictures' names."""
-
-    @staticmethod
-    def put(frames: dict[str, SegmentedFrame], file_name: str, frame: SegmentedFrame) -> None:
-        """Add a frame, whose name must be unique."""
-        check_size(frame.size, frame.where)
-        if frames.setdefault(stem := Path(file_name).stem, frame) is not frame:
-            raise InputError(
-                f"{frame.where}: two pictures are named {shown(stem)}; a room has one of each name."
-            )
-
-    def of(self, frame: PosedFrame) -> FrameMask | None:
-        found = self.frames.get(frame.stem)
-        if found is None:
-            return None
-        return FrameMask(partial(getattr, found, "size"), found.read, lambda: found.classes)
-
-    def wanted(self, frame: PosedFrame) -> str:
-        return f"a picture {shown(frame.stem)} in {self.find(self.folder)[0]}{instead(self.frames)}"
-
-    def classes(self) -> dict[int, str]:
-        classes, self.notes = main_classes(frame.classes for frame in self.frames.values())
-        return classes
+_BACKGROUND = "background"
 
 
 class _Image(BaseModel):
@@ -138,14 +82,62 @@ class _Images(BaseModel):
     images: list[_Image]
     annotations: list[_ImageAnnotation]
 
+    @property
+    def tracks(self) -> list[CocoId | None]:
+        """The track of each annotation."""
+        return [row.track for row in self.annotations]
+
+    @property
+    def pictures(self) -> list[tuple[str, tuple[int, int]]]:
+        """Name and (height, width) of each picture."""
+        return [(image.file_name, (image.height, image.width)) for image in self.images]
+
+    def masks(self, path: Path) -> Iterator[tuple[int, int, Any, str]]:
+        """Index of the annotation, index of the picture, segmentation, and place of each mask."""
+        place_of = {image.id: place for place, image in enumerate(self.images)}
+        for k, row in enumerate(self.annotations):
+            where = f"annotation {shown(row.id)}"
+            if row.image_id not in place_of:
+                raise InputError(
+                    f"{path}, {where}: image {shown(row.image_id)} is not among its images."
+                )
+            yield k, place_of[row.image_id], row.segmentation, where
+
 
 class _Videos(BaseModel):
     categories: list[Category]
     videos: list[_Video]
     annotations: list[_VideoAnnotation]
 
+    @property
+    def tracks(self) -> list[CocoId | None]:
+        """Each annotation is a track."""
+        return [*range(len(self.annotations))]
 
-class CocoMasks(SegmentedFrames):
+    @property
+    def pictures(self) -> list[tuple[str, tuple[int, int]]]:
+        """Name and (height, width) of each frame of the only video."""
+        (video,) = self.videos
+        return [(name, (video.height, video.width)) for name in video.file_names]
+
+    def masks(self, path: Path) -> Iterator[tuple[int, int, Any, str]]:
+        """See `_Images.masks`; a frame without the object has null in place of a mask."""
+        (video,) = self.videos
+        count = len(video.file_names)
+        for k, row in enumerate(self.annotations):
+            where = f"annotation {shown(row.id)}"
+            if row.video_id != video.id or len(row.segmentations) != count:
+                raise InputError(
+                    f"{path}, {where}: it has {len(row.segmentations)} masks of video "
+                    f"{shown(row.video_id)}, but video {shown(video.id)} has {count} frames; an "
+                    "annotation has a mask, or null, for each frame."
+                )
+            for at, mask in enumerate(row.segmentations):
+                if mask is not None:
+                    yield k, at, mask, f"{where}, frame {at}"
+
+
+class CocoMasks(MaskFormat):
     """The masks of one JSON. Ids are tracked if every annotation has a track or belongs to a
     video."""
 
@@ -182,11 +174,10 @@ class CocoMasks(SegmentedFrames):
 
     @property
     def tracked(self) -> bool:
-        coco = self._content
-        return isinstance(coco, _Videos) or all(row.track is not None for row in coco.annotations)
+        return None not in self._content.tracks
 
     @cached_property
-    def frames(self) -> dict[str, SegmentedFrame]:
+    def frames(self) -> dict[str, FrameMask]:
         coco, (path,) = self._content, self.find(self.folder)
         names = {row.id: row.name for row in coco.categories}
         for row in coco.annotations:
@@ -196,95 +187,134 @@ class CocoMasks(SegmentedFrames):
                     "among its categories."
                 )
         class_of = [CROWD if row.iscrowd else names[row.category_id] for row in coco.annotations]
-        frames: dict[str, SegmentedFrame] = {}
-        if isinstance(coco, _Videos):
-            pictures = _frames_of_video(coco, class_of, path)
-        else:
-            pictures = _frames_of_images(coco, class_of, path, self.tracked)
-        for file_name, frame in pictures:
-            self.put(frames, file_name, frame)
-        return frames
+        tracks = coco.tracks if self.tracked else [*range(len(class_of))]
+        number = {track: k for k, track in enumerate(dict.fromkeys(tracks), start=1)}
+        if self.tracked and len(number) >= LARGEST_ID:
+            what = "objects" if isinstance(coco, _Videos) else "tracks"
+            raise InputError(f"{path} has {len(number)} {what}; expected at most {LARGEST_ID - 1}.")
+        frames = [SegmentedFrame(size, str(path)) for _, size in coco.pictures]
+        for k, place, mask, where in coco.masks(path):
+            frames[place].add(number[tracks[k]], class_of[k], mask, where)
+        found: dict[str, FrameMask] = {}
+        for (file_name, _), frame in zip(coco.pictures, frames, strict=True):
+            frame.put(found, file_name)
+        return found
 
 
-def _frames_of_images(
-    coco: _Images, class_of: list[str], path: Path, tracked: bool
-) -> list[tuple[str, SegmentedFrame]]:
-    ordered = [SegmentedFrame((image.height, image.width), str(path)) for image in coco.images]
-    of_id = {image.id: frame for image, frame in zip(coco.images, ordered, strict=True)}
-    tracks = dict.fromkeys(row.track for row in coco.annotations)
-    if tracked and len(tracks) >= LARGEST_ID:
-        raise InputError(f"{path} has {len(tracks)} tracks; expected at most {LARGEST_ID - 1}.")
-    number = {track: k for k, track in enumerate(tracks, start=1)}
-    for k, (row, name) in enumerate(zip(coco.annotations, class_of, strict=True), start=1):
-        if row.image_id not in of_id:
-            raise InputError(
-                f"{path}, annotation {shown(row.id)}: image {shown(row.image_id)} is not among "
-                "its images."
-            )
-        own = number[row.track] if tracked else k
-        of_id[row.image_id].add(own, name, row.segmentation, f"annotation {shown(row.id)}")
-    return [(image.file_name, frame) for image, frame in zip(coco.images, ordered, strict=True)]
+class _Strict(BaseModel):
+    model_config = ConfigDict(strict=True)
 
 
-def _frames_of_video(
-    coco: _Videos, class_of: list[str], path: Path
-) -> list[tuple[str, SegmentedFrame]]:
-    (video,) = coco.videos
-    count = len(video.file_names)
-    ordered = [SegmentedFrame((video.height, video.width), str(path)) for _ in range(count)]
-    if len(coco.annotations) >= LARGEST_ID:
-        raise InputError(
-            f"{path} has {len(coco.annotations)} objects; expected at most {LARGEST_ID - 1}."
-        )
-    for k, (row, name) in enumerate(zip(coco.annotations, class_of, strict=True), start=1):
-        if row.video_id != video.id or len(row.segmentations) != count:
-            raise InputError(
-                f"{path}, annotation {shown(row.id)}: it has {len(row.segmentations)} masks of "
-                f"video {shown(row.video_id)}, but video {shown(video.id)} has {count} frames; "
-                "an annotation has a mask, or null, for each frame."
-            )
-        for at, mask in enumerate(row.segmentations):
-            if mask is not None:
-                ordered[at].add(k, name, mask, f"annotation {shown(row.id)}, frame {at}")
-    return list(zip(video.file_names, ordered, strict=True))
+class _Category(_Strict):
+    id: int
+    name: str
+    isthing: int = 1
 
 
-class _Found(BaseModel):
-    class_name: str
-    segmentation: Any
+class _Segment(_Strict):
+    id: Annotated[int, Field(ge=0, lt=2**24)]
+    category_id: int
+    iscrowd: int = 0
 
 
-class _Picture(BaseModel):
-    image_path: str
-    annotations: list[_Found]
-    img_width: int = Field(ge=1)
-    img_height: int = Field(ge=1)
+class _PanopticFrame(_Strict):
+    file_name: str = ""
+    segments_info: list[_Segment]
 
 
-class GroundedSam2Images(SegmentedFrames):
-    """Ids of single images: the JSON that a demo writes for each picture, in `json_data/`.
+class _Panoptic(_Strict):
+    categories: list[_Category]
+    annotations: list[_PanopticFrame]
 
-    The key `image_path` identifies the frame; the JSON's file name does not matter.
+
+class PanopticPngs(FramePngs):
+    """COCO's panoptic format: PNGs whose colours encode segment ids, and one JSON for all PNGs.
+
+    Video segmenters give an object the same id in all frames; the ids of COCO's own single images
+    are not tracked.
     """
 
-    name = "grounded-sam2"
-    title = f"Grounded-SAM-2 of single images ({LABELS}/)"
-    tracked = False
+    name = "panoptic"
+    title = f"COCO panoptic PNGs ({INSTANCES}/, {PANOPTIC})"
 
     @classmethod
     def find(cls, folder: Path) -> list[Path]:
-        return [] if GroundedSam2.find(folder) else sorted((folder / LABELS).glob("*.json"))
+        table = folder / PANOPTIC
+        return [table, *sorted((folder / INSTANCES).rglob("*.png"))] if table.is_file() else []
+
+    def of_png(self, path: Path) -> FrameMask:
+        return FrameMask(
+            partial(mask_size, path, rgb=True),
+            partial(self._read, path),
+            lambda: self._segments[1].get(path.stem, {}),
+        )
 
     @cached_property
-    def frames(self) -> dict[str, SegmentedFrame]:
-        frames: dict[str, SegmentedFrame] = {}
-        count = 0
-        for path in self.find(self.folder):
-            where = f"{path} (there is no {MASKS}/{PREFIX}*.npy, so it is read as a single image's)"
-            picture = checked(_Picture, read_json(path), where)
-            frame = SegmentedFrame((picture.img_height, picture.img_width), str(path))
-            for row in picture.annotations:
-                count += 1
-                frame.add(count, row.class_name, row.segmentation, f"annotation {len(frame.masks)}")
-            self.put(frames, picture.image_path, frame)
-        return frames
+    def _segments(self) -> tuple[np.ndarray, dict[str, dict[int, str]], set[str]]:
+        """Segment ids, (n,), ascending; the class by new id, k + 1 for the k-th segment, for each
+        frame, by the stem of its PNG; and the classes of stuff that the label set does not have,
+        "background" included, which are no objects."""
+        path = find_table(self.folder)
+        room = checked(_Panoptic, read_json(path), str(path))
+        own = {tidy(name) for name in label_set(self.label_set_name)}
+        stuff = {_BACKGROUND, *STUFF[1:]} - own
+        names = {}
+        for item in room.categories:
+            if item.isthing or tidy(item.name) in own:
+                names[item.id] = item.name
+            else:
+                name = STUFF[stuff_of(item.name)]
+                names[item.id] = name if name in stuff else _BACKGROUND
+        by_frame: dict[str, dict[int, str]] = {}
+        for frame in room.annotations:
+            for segment in frame.segments_info:
+                if segment.category_id not in names:
+                    raise InputError(
+                        f"{path}, '{frame.file_name}': category {segment.category_id} of segment "
+                        f"{segment.id} is not among its categories."
+                    )
+                name = CROWD if segment.iscrowd else names[segment.category_id]
+                by_frame.setdefault(Path(frame.file_name).stem, {})[segment.id] = name
+        ids = sorted({k for classes in by_frame.values() for k in classes} - {0})
+        if not 0 < len(ids) < LARGEST_ID:
+            raise InputError(f"{path} has {len(ids)} segments; expected 1 to {LARGEST_ID - 1}.")
+        number = {segment: k for k, segment in enumerate(ids, start=1)}
+        of_frame = {
+            stem: {number[segment]: name for segment, name in classes.items() if segment}
+            for stem, classes in by_frame.items()
+        }
+        return np.array(ids), of_frame, stuff
+
+    def _read(self, path: Path) -> np.ndarray:
+        """Read a PNG as new ids, (height, width) int32.
+
+        0 is background, k + 1 the k-th segment, n + 1 any id that is missing from the JSON.
+        """
+        known = self._segments[0]
+        ids = read_rgb(path).astype(np.int64) @ (1, 256, 65536)
+        place = np.searchsorted(known, ids)
+        there = known[np.minimum(place, len(known) - 1)] == ids
+        numbers = np.where(there, place + 1, len(known) + 1)
+        return np.where(ids == 0, 0, numbers).astype(np.int32)
+
+    def classes(self) -> dict[int, str]:
+        """Class by id; a segment of stuff with several classes is background.
+
+        Raises:
+            InputError: A segment has different classes in two frames, so ids are not tracked.
+        """
+        first: dict[int, tuple[str, str]] = {}
+        ids, of_frame, stuff = self._segments
+        for stem, classes in of_frame.items():
+            for number, name in classes.items():
+                before, where = first.setdefault(number, (name, stem))
+                if before != name and {before, name} <= stuff:
+                    first[number] = _BACKGROUND, where
+                elif before != name:
+                    raise InputError(
+                        f"{self.folder / PANOPTIC}: segment {ids[number - 1]} is {before} in "
+                        f"'{where}', but {name} in '{stem}'. Ids must be tracked: the same object "
+                        "has the same id in all frames, as video segmenters write them; else pass "
+                        "--tracks auto."
+                    )
+        return {number: name for number, (name, _) in first.items()}

@@ -7,10 +7,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from data_prep.readers.posed.coco import CocoMasks, GroundedSam2Images
+from data_prep.readers.posed.coco import CocoMasks, PanopticPngs
 from data_prep.readers.posed.masks import MaskFormat
-from data_prep.readers.posed.pngs import IdPngs, PanopticPngs
-from data_prep.readers.posed.sam2 import GroundedSam2, ObjectFolders
+from data_prep.readers.posed.segmenters import (
+    GroundedSam2,
+    GroundedSam2Images,
+    IdPngs,
+    ObjectFolders,
+)
 from data_prep.readers.posed.transforms import POSES, pose_files
 from sceneprior.core.checked import shown
 from sceneprior.core.classes import LABEL_SETS, label_set_name

@@ -2,22 +2,25 @@
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from data_prep.readers.frames import mask_intrinsics, sampled_lines
-from data_prep.readers.posed.lens import Lens, Straightened, straighten
+from data_prep.readers.posed.cameras import Lens, Straightened, straighten
 from data_prep.readers.posed.recording import PosedFrame, frame_intrinsics
 from data_prep.tracks.associate import UNKNOWN, FrameMasks, associate
 from sceneprior.core.checked import plain, shown
 from sceneprior.core.classes import VOID
+from sceneprior.core.coco import check_size, decode, paint
 from sceneprior.core.errors import InputError
 from sceneprior.core.id_tables import LARGEST_ID, IdTable, read_mask
 
+PANOPTIC = "panoptic.json"
+TABLES = ("classes.json", "classes.csv", PANOPTIC)
 _LISTED = 3
 _MANY_IDS, _MANY_FRAMES, _ONCE = 12, 5, 0.8
 """A room with at least these numbers of ids and frames is refused if more than this share of the
@@ -34,6 +37,38 @@ class FrameMask:
     """Ids, (height, width) integers, 0 for background."""
     classes: Callable[[], dict[int, str]]
     """Class of each id, if ids belong to single frames."""
+
+
+@dataclass
+class SegmentedFrame:
+    """Masks of one frame as polygons or run lengths, which are decoded when the frame is read.
+    They may overlap (`paint`)."""
+
+    size: tuple[int, int]
+    where: str
+    """File and frame, for messages."""
+    masks: list[tuple[int, Any, str]] = field(default_factory=list)
+    """Id, segmentation and place of each mask."""
+    classes: dict[int, str] = field(default_factory=dict)
+
+    def add(self, number: int, name: str, segmentation: Any, where: str) -> None:
+        """Add a mask; `where` names it within the frame."""
+        self.masks.append((number, segmentation, f"{self.where}, {where}"))
+        self.classes[number] = name
+
+    def read(self) -> np.ndarray:
+        """Ids, (height, width)."""
+        masks = ((k, decode(mask, self.size, where)) for k, mask, where in self.masks)
+        return paint(masks, self.size)
+
+    def put(self, frames: dict[str, FrameMask], file_name: str) -> None:
+        """Add the frame to others by the stem of its picture's name, which must be unique."""
+        check_size(self.size, self.where)
+        if (stem := Path(file_name).stem) in frames:
+            raise InputError(
+                f"{self.where}: two pictures are named {shown(stem)}; a room has one of each name."
+            )
+        frames[stem] = FrameMask(lambda: self.size, self.read, lambda: self.classes)
 
 
 class MaskFormat(ABC):
@@ -62,18 +97,48 @@ class MaskFormat(ABC):
     def find(cls, folder: Path) -> list[Path]:
         """All mask files of a room; empty if the room has no masks in this format."""
 
-    @abstractmethod
+    @property
+    def frames(self) -> Mapping[str, FrameMask]:
+        """Masks by the stem of the frame's picture, for formats that find masks by it."""
+        raise NotImplementedError
+
     def of(self, frame: PosedFrame) -> FrameMask | None:
         """The masks of a frame, even if they show no object; None if it has none."""
+        return self.frames.get(frame.stem)
 
-    @abstractmethod
     def wanted(self, frame: PosedFrame) -> str:
         """Description, for messages, of the expected file of a frame's masks, and of what exists
         instead."""
+        return f"a picture {shown(frame.stem)} in {self.find(self.folder)[0]}{instead(self.frames)}"
 
-    @abstractmethod
     def classes(self) -> dict[int, str]:
         """Class of each id, if ids are the same in all frames."""
+        classes, self.notes = main_classes(frame.classes() for frame in self.frames.values())
+        return classes
+
+
+class FramePngs(MaskFormat):
+    """One PNG per frame: `PosedFrame.instances`."""
+
+    def wanted(self, frame: PosedFrame) -> str:
+        return str(frame.instances)
+
+    def of(self, frame: PosedFrame) -> FrameMask | None:
+        path = frame.instances
+        return self.of_png(path) if path.is_file() else None
+
+    @abstractmethod
+    def of_png(self, path: Path) -> FrameMask:
+        """The masks in a PNG."""
+
+
+def find_table(folder: Path) -> Path:
+    """Find the only table in a folder that maps the room's ids to classes: one of `TABLES`."""
+    found = [folder / name for name in TABLES if (folder / name).is_file()]
+    if len(found) != 1:
+        named = " and ".join(path.name for path in found) or f"no {' or '.join(TABLES)}"
+        raise InputError(f"{folder} has {named}; expected one table with the class of each id.")
+    return found[0]
 
 
 def main_classes(of_frames: Iterable[dict[int, str]]) -> tuple[dict[int, str], list[str]]:
@@ -190,17 +255,11 @@ def read_untracked(
     ids = table.ids(numbers).astype(np.int32)
     # The table's last id stands for masks without a class, whose content is unknown.
     ids[ids == len(table.classes)] = UNKNOWN
-    kept = np.unique(ids[ids > 0])
-    new_id = np.zeros(len(table.classes) + 1, dtype=np.int32)
-    new_id[kept] = np.arange(1, len(kept) + 1)
-    number_of_id = np.zeros(len(kept) + 1, dtype=np.int64)
-    number_of_id[new_id[ids[ids > 0]]] = numbers[ids > 0]
-    ids = np.where(ids > 0, new_id[np.maximum(ids, 0)], ids)
-    given = np.array(original_ids)[number_of_id[1:]]
+    given = np.array(original_ids)[table.objects]
     notes = [*table.notes, *pixels.notes]
     if unlisted:
         notes.append(f"{unlisted} masks have no class in their frame's table: void")
-    frame_masks = FrameMasks(ids, table.classes[kept - 1].astype(np.int64))
+    frame_masks = FrameMasks(ids, table.classes[:-1].astype(np.int64))
     tracks = associate(frame_masks, world_to_camera, intrinsics, given)
     count = len(tracks.object_class)
     notes.append(f"{count} objects are found from {len(given)} masks (--tracks auto)")

@@ -11,17 +11,24 @@ import numpy as np
 from data_prep.engine.plan import digest, digest_of_files, seeded_split
 from data_prep.engine.source import Line, RoomTask
 from data_prep.readers.frames import chosen_frames, room_cameras, shrunk
-from data_prep.readers.posed.cameras import (
+from data_prep.readers.posed.formats import Formats, mask_files
+from data_prep.readers.posed.masks import (
+    TABLES,
+    FrameMask,
+    MaskFormat,
+    read_tracked,
+    read_untracked,
+)
+from data_prep.readers.posed.recording import (
+    INSTANCES,
     UP,
+    Recording,
     floor_center,
+    room_name,
     seems_up,
     upright_cameras,
     why_below_floor,
 )
-from data_prep.readers.posed.formats import Formats, mask_files
-from data_prep.readers.posed.masks import FrameMask, MaskFormat, read_tracked, read_untracked
-from data_prep.readers.posed.pngs import TABLES
-from data_prep.readers.posed.recording import INSTANCES, Recording, room_name
 from data_prep.readers.posed.transforms import POSES, pose_files, read_recording
 from data_prep.readers.reader import FoundRoom, Reader
 from data_prep.readers.rooms import FramedRoom

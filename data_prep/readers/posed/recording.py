@@ -1,97 +1,44 @@
-"""A posed room, independent of its file format: frames with poses, cameras and masks."""
+"""A posed room, independent of its file format: frames with their files, and its up direction."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from data_prep.readers.frames import is_pose
-from data_prep.readers.posed.lens import Lens
+from data_prep.readers.frames import GL_TO_CV, is_pose
+from data_prep.readers.posed.cameras import Camera
 from sceneprior.core.cameras import odd_field_of_view
-from sceneprior.core.checked import plain, shown
+from sceneprior.core.checked import shown
 from sceneprior.core.errors import InputError
 
 INSTANCES = "instances"
 _PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".exr", ".tif", ".tiff", ".bmp", ".heic")
 _LONGEST_NAME = 240
 """Maximum bytes of a path component; file systems take 255, and suffixes are replaced."""
-_OPENCV = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
-_FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
-
-Number = Annotated[float, Field(gt=-1e12, lt=1e12)]
-
-
-class Camera(BaseModel):
-    """Camera keys of a frame, or of a file for all its frames."""
-
-    model_config = ConfigDict(strict=True, frozen=True)
-
-    fl_x: Number | None = None
-    fl_y: Number | None = None
-    cx: Number | None = None
-    cy: Number | None = None
-    w: Number | None = None
-    h: Number | None = None
-    camera_angle_x: Number | None = None
-    camera_angle_y: Number | None = None
-    k1: Number = 0.0
-    k2: Number = 0.0
-    k3: Number = 0.0
-    k4: Number = 0.0
-    p1: Number = 0.0
-    p2: Number = 0.0
-    camera_model: Any = "PINHOLE"
-    is_fisheye: Any = False
-
-    @model_validator(mode="after")
-    def _has_a_lens_that_is_read(self) -> "Camera":
-        model = plain(str(self.camera_model)) if isinstance(self.camera_model, str) else "no text"
-        if model.upper() not in (*_OPENCV, *_FISHEYE):
-            raise ValueError(
-                f"its camera_model is {model}; expected a pinhole, OPENCV or OPENCV_FISHEYE. "
-                "Undistort pictures and masks, or model the camera again."
-            )
-        stray = {"p1": self.p1, "p2": self.p2} if self.fisheye else {"k4": self.k4}
-        for key, value in stray.items():
-            if value:
-                kind = "OPENCV_FISHEYE" if self.fisheye else "OPENCV"
-                raise ValueError(f"its {key} is {value:g}, which {kind} does not have.")
-        return self
-
-    @property
-    def fisheye(self) -> bool:
-        """True for OpenCV's fisheye model."""
-        return bool(self.is_fisheye) or str(self.camera_model).upper() in _FISHEYE
-
-    @property
-    def lens(self) -> Lens:
-        """Lens distortion."""
-        if self.fisheye:
-            return Lens((self.k1, self.k2, self.k3, self.k4), fisheye=True)
-        return Lens((self.k1, self.k2, self.p1, self.p2, self.k3))
+UP = ("auto", "z", "y", "cameras")
+_Y_UP = {
+    "y": np.eye(4),
+    # (x, y, z) with z up -> (x, z, -y); stays right-handed.
+    "z": np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]),
+}
+_LARGEST_SPREAD_M = 100.0
+_LEAST_TURN = 0.1
+"""Minimum ratio of the second to the first singular value of the cameras' sideways axes; if all
+cameras look the same way, their tilt cannot be determined."""
 
 
-class PosedPicture(NamedTuple):
-    """A picture as a tool's files describe it."""
-
-    name: str
-    camera_to_world: np.ndarray
-    """(4, 4) float64 as written: OpenGL axes (x right, y up, z backward), in the file's units."""
-    camera: Camera
-
-
-@dataclass(frozen=True)
-class PosedFrame:
-    """One frame of a room: a `PosedPicture`, and the files of its ids."""
+class PosedFrame(NamedTuple):
+    """One frame of a room."""
 
     name: str
     """Value of `file_path`, for messages."""
     camera_to_world: np.ndarray
+    """(4, 4) float64 as written: OpenGL axes (x right, y up, z backward), in the file's units."""
     camera: Camera
-    instances: Path
+    instances: Path = Path()
     """PNG of ids, if masks are PNGs; it may be missing."""
     known: Path | None = None
     """PNG from `mask_path`; 0 marks pixels with unknown ids."""
@@ -99,7 +46,7 @@ class PosedFrame:
     @property
     def stem(self) -> str:
         """File name without folders and extension, under which segmenters store the masks."""
-        return Path(_as_png(self.name)).stem
+        return Path(as_png(self.name)).stem
 
 
 @dataclass(frozen=True)
@@ -141,29 +88,16 @@ def ids_path(folder: Path, name: str) -> Path:
     The path is `instances/<name without its extension>.png` if that exists (for frames in several
     folders), else `instances/<stem>.png`.
     """
-    path = Path(_as_png(path_text(name)))
+    path = Path(as_png(path_text(name)))
     whole = folder / INSTANCES / path
     if ".." not in path.parts and not path.is_absolute() and whole.is_file():
         return whole
     return folder / INSTANCES / path.name
 
 
-def _as_png(name: str) -> str:
+def as_png(name: str) -> str:
     path = Path(name)
     return f"{path.with_suffix('') if path.suffix.lower() in _PICTURES else path}.png"
-
-
-def check_one_png_a_frame(path: Path, frames: tuple[PosedFrame, ...]) -> None:
-    """Raise an `InputError` if two frames would share an instance-id PNG."""
-    first: dict[Path, str] = {}
-    for frame in frames:
-        other = first.setdefault(frame.instances, frame.name)
-        if other is not frame.name:
-            raise InputError(
-                f"{path}: frames {shown(other)} and {shown(frame.name)} would share the ids in "
-                f"{frame.instances}; store the ids in the same folders as the frames: "
-                f"{INSTANCES}/{_as_png(other)}."
-            )
 
 
 def room_name(folder: Path) -> str:
@@ -173,7 +107,7 @@ def room_name(folder: Path) -> str:
 
 
 def frame_intrinsics(
-    frame: PosedFrame | PosedPicture, mask_size: tuple[int, int]
+    frame: PosedFrame, mask_size: tuple[int, int]
 ) -> tuple[np.ndarray, tuple[int, int]]:
     """Pinhole intrinsics of a frame, and the (height, width) of the picture that they refer to.
 
@@ -201,7 +135,7 @@ def frame_intrinsics(
     return np.array([[fl_x, 0, cx], [0, fl_y, cy], [0, 0, 1.0]]), (int(height), int(width))
 
 
-def _focal(frame: PosedFrame | PosedPicture, key: str, side: float) -> float | None:
+def _focal(frame: PosedFrame, key: str, side: float) -> float | None:
     """Focal length in pixels from `camera_angle_x` or `_y`; None if the key is missing."""
     angle_rad: float | None = getattr(frame.camera, key)
     if not angle_rad:
@@ -213,3 +147,93 @@ def _focal(frame: PosedFrame | PosedPicture, key: str, side: float) -> float | N
             + (f"; {guess}" if 0 < angle_rad < 180 else "")
         )
     return side / 2 / math.tan(angle_rad / 2)
+
+
+def upright_cameras(
+    recording: Recording, frames: Sequence[int], up: str, metres_per_unit: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rotate cameras to a world whose y points up, in metres.
+
+    `up` is one of `UP`; `auto` is the recording's own.
+
+    Returns:
+        Camera-to-world matrices, (views, 4, 4) with OpenCV axes, and the (4, 4) transform from the
+        file's world (in metres) to this one.
+    """
+    poses = np.stack([recording.frames[i].camera_to_world for i in frames])
+    poses[:, :3, 3] *= recording.metres_per_unit or metres_per_unit
+    if up == "auto":
+        up = recording.up
+    turn = _turn_of_cameras(recording, poses) if up == "cameras" else _Y_UP[up]
+    upright = turn @ poses
+    spread = np.ptp(upright[:, :3, 3], axis=0).max()
+    if spread > _LARGEST_SPREAD_M:
+        unit = "0.01, if they are in centimetres" if spread < 3000 else "0.001, in millimetres"
+        raise InputError(
+            f"{recording.path}: its cameras are spread over {spread:.0f} m; is metres_per_unit "
+            f"wrong? Pass --metres-per-unit {unit}."
+        )
+    return upright @ GL_TO_CV, turn
+
+
+def _turn_of_cameras(recording: Recording, poses: np.ndarray) -> np.ndarray:
+    """Rotation (4, 4) that makes y the up direction of cameras that were held upright.
+
+    The sideways axes of such cameras are horizontal, whatever their pitch, so up is the direction
+    perpendicular to all of them.
+    """
+    _, strength, axes = np.linalg.svd(poses[:, :3, 0])
+    if len(strength) < 2 or strength[1] < _LEAST_TURN * strength[0]:
+        raise InputError(
+            f"{recording.path}: its cameras all look in about the same direction, so the up "
+            "direction is unknown; turn the poses until an axis points up, and name it with --up."
+        )
+    y = axes[2] * np.sign(axes[2] @ poses[:, :3, 1].sum(axis=0))
+    x = np.eye(3)[np.argmin(np.abs(y))]
+    x = x - (x @ y) * y
+    x /= np.linalg.norm(x)
+    turn = np.eye(4)
+    turn[:3, :3] = x, y, np.cross(x, y)
+    return turn
+
+
+def floor_center(recording: Recording, turn: np.ndarray) -> np.ndarray | None:
+    """x, z of the floor's centre in the world of `upright_cameras`; None if the file has none."""
+    if recording.floor_center_m is None:
+        return None
+    level = [axis for axis in range(3) if abs(turn[1, axis]) < 0.5]
+    if len(level) != 2 or not np.isin(np.abs(turn[1]), (0.0, 1.0)).all():
+        raise InputError(
+            f"{recording.path}: floor_center_m is along two level axes, but none of this world's "
+            "is level; leave it out, or turn the poses and name the axis with --up."
+        )
+    center = np.zeros(4)
+    center[level] = recording.floor_center_m
+    return (turn @ center)[[0, 2]]
+
+
+def why_below_floor(recording: Recording, turn: np.ndarray) -> str:
+    """Likely reason why cameras are below the floor, as the end of a sentence."""
+    written = recording.good_poses()
+    axis = int(np.abs(turn[1, :3]).argmax())
+    # The sideways axis of an upright camera is level: it has no part along the axis up.
+    level, level_if_inverted = np.abs(written[:, axis, 0]), np.abs(written[:, 0, axis])
+    if level_if_inverted.mean() < 0.5 * level.mean():
+        return "the matrices seem to be world-to-camera: invert each."
+    other = seems_up(recording)
+    if level.mean() > 0.2 and other is not None and "xyz"[axis] != other:
+        return f"the tops of the pictures point along {other}: pass --up {other}."
+    return (
+        "are the last columns of the matrices translations from world to camera, not positions "
+        "(-R t)? Else check floor_m, metres_per_unit and --up."
+    )
+
+
+def seems_up(recording: Recording) -> str | None:
+    """Axis along which the cameras' up vectors point, `y` or `z`; None if neither is clear."""
+    tops = recording.good_poses()[:, :3, 1]
+    if not len(tops):
+        return None
+    mean = tops.mean(axis=0)
+    best = "y" if mean[1] > mean[2] else "z"
+    return best if max(mean[1], mean[2]) > 0.7 else None

@@ -8,27 +8,19 @@ about the room are read.
 """
 
 import contextlib
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from data_prep.readers.posed.apps import (
-    polycam_files,
-    read_keyframes,
-    read_metadata,
-    record3d_files,
-)
-from data_prep.readers.posed.colmap import model_files, read_model
+from data_prep.readers.posed.cameras import Camera, Number
+from data_prep.readers.posed.captures import TOOLS
 from data_prep.readers.posed.recording import (
-    Camera,
-    Number,
+    INSTANCES,
     PosedFrame,
-    PosedPicture,
     Recording,
-    check_one_png_a_frame,
+    as_png,
     ids_path,
     path_text,
 )
@@ -56,13 +48,9 @@ class _RoomEntry(BaseModel):
 
 POSES = {
     "nerfstudio": f"nerfstudio ({FILE_NAME})",
-    "colmap": "COLMAP (sparse/)",
-    "polycam": "Polycam (keyframes/)",
-    "record3d": "Record3D (metadata)",
+    **{name: tool.title for name, tool in TOOLS.items()},
 }
 """Formats of poses: the value of `--from`, and the tool's name with its files."""
-_UP = {"nerfstudio": "z", "colmap": "cameras", "polycam": "y", "record3d": "cameras"}
-_IN_METRES = ("polycam", "record3d")
 
 
 def pose_files(folder: Path, given: str | None = None) -> tuple[str, list[Path]]:
@@ -76,16 +64,17 @@ def pose_files(folder: Path, given: str | None = None) -> tuple[str, list[Path]]
     whole = folder / FILE_NAME
     of_room = [whole] if whole.is_file() else []
     found = {
-        "colmap": [*(model_files(folder) or ())],
-        "polycam": polycam_files(folder),
-        "record3d": record3d_files(folder),
+        name: [*files, *of_room] for name, tool in TOOLS.items() if (files := tool.find(folder))
     }
-    found = {name: [*files, *of_room] for name, files in found.items() if files}
     own = of_room or sorted(folder.glob("transforms_*.json"))
-    if own and not (of_room and found and _has_no_frames(whole)):
-        found["nerfstudio"] = own
-        if given != "colmap":
-            found.pop("colmap", None)
+    if own:
+        data: Any = None
+        with contextlib.suppress(InputError):  # reading it will raise the error
+            data = read_json(whole) if of_room and found else None
+        if not isinstance(data, dict) or "frames" in data:
+            found["nerfstudio"] = own
+            if given != "colmap":
+                found.pop("colmap", None)
     if given is not None:
         return given, found.get(given, [])
     if len(found) > 1:
@@ -94,14 +83,6 @@ def pose_files(folder: Path, given: str | None = None) -> tuple[str, list[Path]]
             f"choose with --from {' or --from '.join(sorted(found))}."
         )
     return next(iter(found.items()), ("nerfstudio", []))
-
-
-def _has_no_frames(whole: Path) -> bool:
-    try:
-        data = read_json(whole)
-    except InputError:
-        return False  # reading it will raise the error
-    return isinstance(data, dict) and "frames" not in data
 
 
 def read_recording(folder: Path, given: str | None = None) -> Recording:
@@ -114,31 +95,33 @@ def read_recording(folder: Path, given: str | None = None) -> Recording:
     jsons = [(path, read_json(path)) for path in files if name == "nerfstudio"]
     rooms = jsons or [(path, read_json(path)) for path in files if path == folder / FILE_NAME]
     of_room = [(path, checked(_RoomEntry, data, str(path))) for path, data in rooms]
-    frames: list[PosedFrame] = []
-    for path, data in jsons:
-        frames += _frames(path, data)
-    if name != "nerfstudio":
-        own = [path for path in files if path != folder / FILE_NAME]
-        for picture in _pictures(name, own):
-            frames.append(PosedFrame(*picture, ids_path(folder, picture.name)))
-    check_one_png_a_frame(files[0], tuple(frames))
+    if name == "nerfstudio":
+        tool, frames = None, _frames(jsons)
+    else:
+        tool = TOOLS[name]
+        read = tool.read([path for path in files if path != folder / FILE_NAME])
+        frames = [frame._replace(instances=ids_path(folder, frame.name)) for frame in read]
+    first: dict[Path, str] = {}
+    for frame in frames:
+        other = first.setdefault(frame.instances, frame.name)
+        if other is not frame.name:
+            raise InputError(
+                f"{files[0]}: frames {shown(other)} and {shown(frame.name)} would share the ids in "
+                f"{frame.instances}; store the ids in the same folders as the frames: "
+                f"{INSTANCES}/{as_png(other)}."
+            )
     metres_per_unit = _one("metres_per_unit", of_room)
+    if metres_per_unit is None and tool is not None and tool.in_metres:
+        metres_per_unit = 1.0
     return Recording(
         folder,
         files[0],
         tuple(frames),
         _one("floor_m", of_room),
         _one("floor_center_m", of_room),
-        1.0 if metres_per_unit is None and name in _IN_METRES else metres_per_unit,
-        _UP[name],
+        metres_per_unit,
+        "z" if tool is None else tool.up,
     )
-
-
-def _pictures(name: str, files: list[Path]) -> Iterable[PosedPicture]:
-    """The pictures of another tool's files."""
-    if name == "polycam":
-        return read_keyframes(files)
-    return read_metadata(files[0]) if name == "record3d" else read_model(*files)
 
 
 def _one(key: str, rooms: list[tuple[Path, _RoomEntry]]) -> Any:
@@ -154,32 +137,35 @@ def _one(key: str, rooms: list[tuple[Path, _RoomEntry]]) -> Any:
     return said[0][1] if said else None
 
 
-def _frames(path: Path, data: dict[str, Any]) -> list[PosedFrame]:
-    if not isinstance(data.get("frames"), list) or not data["frames"]:
-        raise InputError(f"{path} has no list `frames` with a frame in it.")
-    return [_frame(path, data, number) for number in range(len(data["frames"]))]
-
-
-def _frame(path: Path, data: dict[str, Any], number: int) -> PosedFrame:
-    item = data["frames"][number]
-    if not isinstance(item, dict) or not isinstance(item.get("file_path"), str):
-        raise InputError(f"{path}, frame {number}: it has no `file_path`.")
-    name = item["file_path"]
-    where = f"{path}, frame {shown(name)}"
-    try:
-        ids = ids_path(path.parent, name)
-    except InputError as error:
-        raise InputError(f"{path}, frame {number}: `file_path` {error}") from None
-    own = {key: value for key, value in item.items() if value is not None}
-    of_file = {key: data[key] for key in Camera.model_fields if data.get(key) is not None}
-    entry = checked(_FrameEntry, of_file | own, where)
-    return PosedFrame(
-        name,
-        _matrix(where, item.get("transform_matrix")),
-        entry,
-        path.parent / entry.instance_path if entry.instance_path else ids,
-        path.parent / entry.mask_path if entry.mask_path else None,
-    )
+def _frames(jsons: list[tuple[Path, Any]]) -> list[PosedFrame]:
+    """The frames of a room's JSONs."""
+    frames = []
+    for path, data in jsons:
+        if not isinstance(data.get("frames"), list) or not data["frames"]:
+            raise InputError(f"{path} has no list `frames` with a frame in it.")
+        of_file = {key: data[key] for key in Camera.model_fields if data.get(key) is not None}
+        for number, item in enumerate(data["frames"]):
+            where = f"{path}, frame {number}"
+            if not isinstance(item, dict) or not isinstance(item.get("file_path"), str):
+                raise InputError(f"{where}: it has no `file_path`.")
+            name = item["file_path"]
+            try:
+                ids = ids_path(path.parent, name)
+            except InputError as error:
+                raise InputError(f"{where}: `file_path` {error}") from None
+            where = f"{path}, frame {shown(name)}"
+            own = {key: value for key, value in item.items() if value is not None}
+            entry = checked(_FrameEntry, of_file | own, where)
+            frames.append(
+                PosedFrame(
+                    name,
+                    _matrix(where, item.get("transform_matrix")),
+                    entry,
+                    path.parent / entry.instance_path if entry.instance_path else ids,
+                    path.parent / entry.mask_path if entry.mask_path else None,
+                )
+            )
+    return frames
 
 
 def _matrix(where: str, value: Any) -> np.ndarray:

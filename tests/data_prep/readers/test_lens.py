@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from data_prep.readers.posed.lens import Lens, straighten
+from data_prep.readers.posed.cameras import Lens, straighten
 
 K = np.array([[80.0, 0, 63], [0, 82, 49], [0, 0, 1]])
 SIZE = (96, 128)

@@ -12,7 +12,7 @@ from posed_files import SET, PosedRoom, furniture, prepared
 from refusals import refused
 
 from data_prep.readers.posed.formats import MASKS, Formats, read_formats, read_label_set
-from data_prep.readers.posed.pngs import find_table
+from data_prep.readers.posed.masks import find_table
 from data_prep.readers.posed.reader import Posed
 from data_prep.readers.posed.transforms import POSES, read_recording
 from sceneprior.core.classes import STUFF

@@ -1,21 +1,30 @@
-"""Reads the masks of SAM 2's videos and of Grounded-SAM-2's trackers.
+"""Masks as segmenters write them: PNGs of ids, SAM 2's folders, Grounded-SAM-2's arrays and JSONs.
 
 Source: `save_masks_to_dir` of `tools/vos_inference.py` in facebookresearch/sam2, which writes them
 with `--per_obj_png_file`, and SA-V, which has the same layout;
-`grounded_sam2_tracking_demo_with_continuous_id.py` and `utils/mask_dictionary_model.py` in
-IDEA-Research/Grounded-SAM-2.
+`grounded_sam2_tracking_demo_with_continuous_id.py`, `utils/mask_dictionary_model.py` and
+`grounded_sam2_local_demo.py` in IDEA-Research/Grounded-SAM-2.
 """
 
 import re
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 
-from data_prep.readers.posed.masks import FrameMask, MaskFormat, instead, main_classes
-from data_prep.readers.posed.pngs import find_table
-from data_prep.readers.posed.recording import PosedFrame
+from data_prep.readers.posed.masks import (
+    TABLES,
+    FrameMask,
+    FramePngs,
+    MaskFormat,
+    SegmentedFrame,
+    find_table,
+    instead,
+    main_classes,
+)
+from data_prep.readers.posed.recording import INSTANCES, PosedFrame
 from sceneprior.core.checked import checked, plain
 from sceneprior.core.coco import paint
 from sceneprior.core.errors import InputError
@@ -26,6 +35,49 @@ MASKS, LABELS, PREFIX = "mask_data", "json_data", "mask_"
 """Folders of Grounded-SAM-2's ids and classes, and the beginning of their files' names."""
 PLACES = ("masks", ".")
 """Possible parents of the objects' folders, within a room's folder."""
+
+
+class IdPngs(FramePngs):
+    """PNGs whose values are ids. The classes are in the room's table or, for ids of single frames,
+    in a JSON beside each PNG with the same stem, in any form of `read_class_table`."""
+
+    name = "png"
+    title = "PNGs of ids (instances/)"
+
+    @classmethod
+    def find(cls, folder: Path) -> list[Path]:
+        inside = folder / INSTANCES
+        return sorted(inside.rglob("*.png")) + sorted(inside.rglob("*.json"))
+
+    @property
+    def tracked(self) -> bool:
+        """False if the classes are beside each PNG and the room has no table."""
+        beside = (self.folder / INSTANCES).rglob("*.json")
+        return any((self.folder / name).is_file() for name in TABLES) or not any(beside)
+
+    def of_png(self, path: Path) -> FrameMask:
+        return FrameMask(
+            partial(mask_size, path), partial(read_mask, path), partial(self._classes_of, path)
+        )
+
+    @cached_property
+    def _table(self) -> dict[int, str]:
+        return read_class_table(find_table(self.folder))
+
+    def classes(self) -> dict[int, str]:
+        return self._table
+
+    def _classes_of(self, path: Path) -> dict[int, str]:
+        own = path.with_suffix(".json")
+        if own.is_file():
+            return read_class_table(own)
+        try:
+            return self._table
+        except InputError as error:
+            raise InputError(
+                f"{str(error).removesuffix('.')}; or put the classes of a frame's ids into "
+                f"{own.name} beside its PNG."
+            ) from None
 
 
 class ObjectFolders(MaskFormat):
@@ -61,24 +113,20 @@ class ObjectFolders(MaskFormat):
         return folders
 
     @cached_property
-    def _stems(self) -> dict[str, list[int]]:
-        """Ids of the objects that have a mask in each frame, by the frame's stem."""
-        stems: dict[str, list[int]] = {}
+    def frames(self) -> dict[str, FrameMask]:
+        paths: dict[str, dict[int, Path]] = {}
         for number, folder in sorted(self._objects.items()):
             for path in folder.glob("*.png"):
-                stems.setdefault(path.stem, []).append(number)
-        return stems
-
-    def of(self, frame: PosedFrame) -> FrameMask | None:
-        numbers = self._stems.get(frame.stem, [])
-        paths = {number: self._objects[number] / f"{frame.stem}.png" for number in numbers}
-        if not paths:
-            return None
-        size = partial(mask_size, next(iter(paths.values())))
-        return FrameMask(size, lambda: _painted(paths, size()), self.classes)
+                paths.setdefault(path.stem, {})[number] = path
+        return {
+            stem: FrameMask(
+                partial(mask_size, next(iter(own.values()))), partial(_painted, own), self.classes
+            )
+            for stem, own in paths.items()
+        }
 
     def wanted(self, frame: PosedFrame) -> str:
-        return f"{min(self._objects.values())}/{frame.stem}.png{instead(self._stems)}"
+        return f"{min(self._objects.values())}/{frame.stem}.png{instead(self.frames)}"
 
     def classes(self) -> dict[int, str]:
         try:
@@ -104,16 +152,15 @@ def _object_folders(room: Path) -> list[Path]:
     return []
 
 
-def _painted(paths: dict[int, Path], size: tuple[int, int]) -> np.ndarray:
+def _painted(paths: dict[int, Path]) -> np.ndarray:
     """Ids of a frame, (height, width), from the PNG of each object."""
-    masks = {}
-    for number, path in paths.items():
-        masks[number] = read_mask(path) > 0
-        if masks[number].shape != size:
-            came = masks[number].shape
+    masks = {number: read_mask(path) > 0 for number, path in paths.items()}
+    size = next(iter(masks.values())).shape
+    for number, mask in masks.items():
+        if mask.shape != size:
             raise InputError(
-                f"{path} is {came[1]} x {came[0]} pixels, but the masks of other objects "
-                f"{size[1]} x {size[0]}; write all masks at the size of the pictures."
+                f"{paths[number]} is {mask.shape[1]} x {mask.shape[0]} pixels, but the masks of "
+                f"other objects {size[1]} x {size[0]}; write all masks at the size of the pictures."
             )
     return paint(masks.items(), size)
 
@@ -141,21 +188,20 @@ class GroundedSam2(MaskFormat):
         masks = sorted((folder / MASKS).glob(f"{PREFIX}*.npy"))
         return [*masks, *sorted((folder / LABELS).glob(f"{PREFIX}*.json"))] if masks else []
 
-    def _path(self, frame: PosedFrame) -> Path:
-        return self.folder / MASKS / f"{PREFIX}{frame.stem}.npy"
-
-    def of(self, frame: PosedFrame) -> FrameMask | None:
-        path = self._path(frame)
-        if not path.is_file():
-            return None
-        labels = self.folder / LABELS / f"{PREFIX}{frame.stem}.json"
-        return FrameMask(
-            lambda: _open(path).shape, partial(_read_ids, path), partial(_labels, labels)
-        )
+    @cached_property
+    def frames(self) -> dict[str, FrameMask]:
+        return {
+            path.stem.removeprefix(PREFIX): FrameMask(
+                partial(_size_of_ids, path),
+                partial(_read_ids, path),
+                partial(_labels, self.folder / LABELS / f"{path.stem}.json"),
+            )
+            for path in (self.folder / MASKS).glob(f"{PREFIX}*.npy")
+        }
 
     def wanted(self, frame: PosedFrame) -> str:
-        there = (path.stem for path in (self.folder / MASKS).glob(f"{PREFIX}*.npy"))
-        return f"{self._path(frame)}{instead(there)}"
+        there = (f"{PREFIX}{stem}" for stem in self.frames)
+        return f"{self.folder / MASKS / f'{PREFIX}{frame.stem}.npy'}{instead(there)}"
 
     def classes(self) -> dict[int, str]:
         paths = sorted((self.folder / LABELS).glob(f"{PREFIX}*.json"))
@@ -166,6 +212,11 @@ class GroundedSam2(MaskFormat):
                 f"mask of {MASKS}, as Grounded-SAM-2 writes them."
             )
         return classes
+
+
+def _size_of_ids(path: Path) -> tuple[int, int]:
+    height, width = _open(path).shape
+    return height, width
 
 
 def _read_ids(path: Path) -> np.ndarray:
@@ -207,3 +258,44 @@ def _open(path: Path) -> np.ndarray:
         f"{path} holds {found}; expected integer ids, (height, width), as Grounded-SAM-2 writes "
         "them."
     )
+
+
+class _Found(BaseModel):
+    class_name: str
+    segmentation: Any
+
+
+class _Picture(BaseModel):
+    image_path: str
+    annotations: list[_Found]
+    img_width: int = Field(ge=1)
+    img_height: int = Field(ge=1)
+
+
+class GroundedSam2Images(MaskFormat):
+    """Ids of single images: the JSON that a demo writes for each picture, in `json_data/`.
+
+    The key `image_path` identifies the frame; the JSON's file name does not matter.
+    """
+
+    name = "grounded-sam2"
+    title = f"Grounded-SAM-2 of single images ({LABELS}/)"
+    tracked = False
+
+    @classmethod
+    def find(cls, folder: Path) -> list[Path]:
+        return [] if GroundedSam2.find(folder) else sorted((folder / LABELS).glob("*.json"))
+
+    @cached_property
+    def frames(self) -> dict[str, FrameMask]:
+        frames: dict[str, FrameMask] = {}
+        count = 0
+        for path in self.find(self.folder):
+            where = f"{path} (there is no {MASKS}/{PREFIX}*.npy, so it is read as a single image's)"
+            picture = checked(_Picture, read_json(path), where)
+            frame = SegmentedFrame((picture.img_height, picture.img_width), str(path))
+            for row in picture.annotations:
+                count += 1
+                frame.add(count, row.class_name, row.segmentation, f"annotation {len(frame.masks)}")
+            frame.put(frames, picture.image_path)
+        return frames
