@@ -17,7 +17,7 @@ GOLDEN = FOLDER / "runs"
 TAKEN_ON = (2026, 1, 1, 0, 0, 0)
 """Date of all files in the archives, so that the same run gives the same archive."""
 LIFTED = GOLDEN / "lifted_toy_shards.zip"
-"""What was lifted from the toy shards. It is found again where the shards differ."""
+"""Parts fitted to the toy shards. They are found again where the shards differ."""
 _RESUMED = ("optimizer_states", "lr_schedulers", "callbacks", "loops")
 
 
@@ -70,14 +70,14 @@ def _without_optimizers(path: Path) -> bytes:
 
 
 def add_lifted(shards: Path) -> None:
-    """Put what was lifted from the toy shards beside them, as training does."""
+    """Put the parts fitted to the toy shards beside them, as training does."""
     with zipfile.ZipFile(LIFTED) as kept:
         kept.extractall(shards)
 
 
 def take_lifted(shards: Path) -> None:
-    """Keep what training has lifted from the toy shards, but for shapes, which are found fast."""
-    found = [path for path in sorted(shards.glob("lifted_*.npz")) if "shapes" not in path.name]
+    """Keep the parts that training has fitted; all else is lifted fast."""
+    found = sorted(shards.glob("lifted_parts_*.npz"))
     _write(LIFTED, {path.name: path.read_bytes() for path in found})
 
 

@@ -9,7 +9,6 @@ from parts_of_rooms import boxes, rays_of
 from sceneprior.core.parts import Parts, filled_cells
 from sceneprior.core.wall_lines import Wall
 from sceneprior.lifted.lifting import LiftedBoxes, RayPool, ShapeGrid
-from sceneprior.lifted.lifting.cache import LiftedCache
 from sceneprior.lifted.lifting.dataset import LiftedDataset
 from sceneprior.lifted.prototype_decoder import PrototypeConfig, PrototypeDecoder
 from sceneprior.lifted.sampler.network import RoomSampler, SamplerConfig
@@ -30,22 +29,22 @@ class Lifted(LiftedDataset):
     """Rooms without shards: what the sampler reads of lifted ones."""
 
     def __init__(self, boxes: list[LiftedBoxes], classes: list[int], shapes: list[Parts]):
-        self.rotations, self.label_set, self.boxes = 1, "toy", boxes
-        self._cache = LiftedCache(Path("no folder"), "train", [], "")
+        self.rotations, self.label_set = 1, "toy"
+        self.counts = [len(room.explained) for room in boxes]
+        self.boxes = LiftedBoxes(*(np.concatenate(part) for part in zip(*boxes, strict=True)))
+        columns = [np.split(part, np.cumsum(self.counts)[:-1]) for part in self.boxes]
+        self.its_boxes = [LiftedBoxes(*room) for room in zip(*columns, strict=True)]  # to change
+        self._parts_file, self._key = Path("no folder") / "parts.npz", ""
         self.plain_ids = [f"room{row}" for row in range(len(boxes))]
         self.object_classes = np.array(classes, dtype=np.int64)
         self._shape = ShapeGrid(CELLS, 1.0)
         pools = [rays_of(each, RAYS, row, margin=1.0) for row, each in enumerate(shapes)]
         self.rays = RayPool(*(np.stack(part) for part in zip(*pools, strict=True)))
         self._hulls = np.stack([filled_cells(each, CELLS, 1.0) for each in shapes])
-
-        self.its_walls: list[list[Wall]] = [[] for _ in boxes]
+        self.walls: list[list[Wall]] = [[] for _ in boxes]
 
     def hulls(self) -> np.ndarray:
         return self._hulls
-
-    def walls(self) -> list[list[Wall]]:
-        return self.its_walls
 
 
 def lifted_rooms(count: int = 6, seed: int = 0) -> Lifted:

@@ -128,14 +128,9 @@ class LiftedConfig(PriorConfig):
             InputError: the rooms do not fit the config.
         """
         data, shape = self.data, self.model.shape
-        rooms = LiftedDataset(
-            Path(data.shards),
-            split,
-            rotations=data.rotations,
-            view_fraction=data.view_fraction,
-            shape=ShapeGrid(shape.cells, shape.margin),
-            seed=self.seed,
-        )
+        grid = ShapeGrid(shape.cells, shape.margin)
+        given = (data.rotations, data.view_fraction, self.seed)
+        rooms = LiftedDataset(Path(data.shards), split, grid, *given)
         self.check_rooms(rooms, self.model.max_objects)
         return rooms
 

@@ -14,7 +14,8 @@ from torch.nn import functional as F
 
 from sceneprior.core.settings import Section
 from sceneprior.core.views import DecodedScenes
-from sceneprior.lifted.rooms import LiftedRooms, PosedScenes
+from sceneprior.lifted.lifting.dataset import LiftedRooms
+from sceneprior.lifted.rooms import PosedScenes
 from sceneprior.paper.losses import class_loss, completeness_targets, mean_of_objects, take
 from sceneprior.paper.matching import Matches, assign, class_cost
 

@@ -1,35 +1,12 @@
-"""Batches of rooms of the lifted method: boxes from masks, and objects with posed prototypes."""
+"""Rooms whose objects are posed prototypes."""
 
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from sceneprior.core.views import Batch, DecodedScenes, RoomBoxes
-
-
-@dataclass(frozen=True)
-class LiftedRooms(Batch):
-    """Tracked objects of a batch of rooms, lifted to 3D from masks alone (`lifted/lifting`).
-
-    Objects are padded to the largest room's count.
-    """
-
-    room_index: Int[Tensor, " rooms"]
-    """Row of each room in the data set, which is also the row of its latent vector."""
-    object_class: Int[Tensor, "rooms objects"]
-    """Index into the label set; 0 where `is_object` is false."""
-    is_object: Bool[Tensor, "rooms objects"]
-    """False for padding; the first n entries of a room with n tracked objects are true."""
-    is_lifted: Bool[Tensor, "rooms objects"]
-    """True if the object's box is known, because some view shows the object."""
-    boxes_m: Float[Tensor, "rooms objects 6"]
-    """Axis-aligned boxes in the room frame: centre x, y, z, then full extents."""
-    looks: Int[Tensor, "rooms objects"] | None = None
-    """Look (prototype * 8 + pose) nearest to the lifted shape (`lifted/prototypes.py`); -1 if there
-    is none."""
-    room_ids: tuple[str, ...] = ()
+from sceneprior.core.views import DecodedScenes, RoomBoxes
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from sceneprior.lifted.lifting.dataset import LiftedDataset
+from sceneprior.lifted.lifting.dataset import LiftedDataset, LiftedRooms
 from sceneprior.lifted.losses import (
     LiftedLossConfig,
     latent_loss,
@@ -13,7 +13,6 @@ from sceneprior.lifted.losses import (
     shape_code_loss,
 )
 from sceneprior.lifted.prototype_decoder import PrototypeDecoder
-from sceneprior.lifted.rooms import LiftedRooms
 from sceneprior.paper.stages import LatentStage
 from sceneprior.training.steps import batch_seed, check_finite, full_precision
 

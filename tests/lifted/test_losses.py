@@ -13,6 +13,7 @@ from torch.testing import assert_close
 
 from sceneprior.core.errors import InputWarning
 from sceneprior.core.views import DecodedScenes
+from sceneprior.lifted.lifting.dataset import LiftedRooms
 from sceneprior.lifted.losses import (
     PER_METRE,
     latent_loss,
@@ -21,7 +22,7 @@ from sceneprior.lifted.losses import (
     shape_code_loss,
     sliced_wasserstein,
 )
-from sceneprior.lifted.rooms import LiftedRooms, PosedScenes
+from sceneprior.lifted.rooms import PosedScenes
 
 COUNTS = (3, 2, 0)
 

@@ -4,21 +4,13 @@ views, and rays around the masks, which either meet the object or pass through e
 from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Real
+from jaxtyping import Bool, Float, Int
 from numba import njit
 
-from sceneprior.core.cameras import camera_centers, nearest_to_rays, pixel_rays
+from sceneprior.core.cameras import camera_centers, nearest_to_rays
 from sceneprior.core.observations import RoomViews
 from sceneprior.lifted.lifting import LiftedBoxes, RayPool
-from sceneprior.lifted.lifting.hulls import (
-    MOST_EMPTY,
-    Sightings,
-    carve,
-    cells_along,
-    own_in,
-    pass_through,
-    sightings_of,
-)
+from sceneprior.lifted.lifting.hulls import MOST_EMPTY, NEVER, Hull, Sightings, carve, own_in
 from sceneprior.render.silhouettes.cpu.kernels import in_threads
 
 GRIDS = ((16, 0.6), (24, 0.6), (40, 0.4), (40, 0.4))
@@ -40,43 +32,35 @@ FAR_M = 100.0
 """Length of rays that no object stops."""
 
 
-def lift_boxes(
-    views: RoomViews, chosen: Int[np.ndarray, " views"] | None = None, seed: int = 0
-) -> LiftedBoxes:
+def lift_boxes(views: RoomViews) -> LiftedBoxes:
     """3D boxes of a room's objects, from instance ids and cameras; no 3D ground truth is used.
 
     An object's visual hull is carved coarse to fine. On each grid, the sides of the box are moved
     inwards one after another, as long as every ray through one of the object's pixels still meets
     a cell of the hull inside the box. The next grid spans only this box, which drops the parts of
-    the hull that no ray needs.
-
-    `views` is a room, read with its images, of which only the views `chosen` are used (None: all).
-    `seed` chooses the pixels whose rays are used.
+    the hull that no ray needs. `views` is a room, read with its images.
     """
-    rng = np.random.default_rng(seed)
-    rows = np.arange(len(views.visible)) if chosen is None else chosen
-    found = [
-        _lift(views, rows[views.visible[rows, item]], item, rng)
-        for item in range(len(views.object_class))
-    ]
+    rng = np.random.default_rng(0)
+    found = [_lift(Sightings.of(views, item), rng) for item in range(len(views.object_class))]
     sides_m = np.array([sides for *sides, _ in found]).reshape(-1, 2, 3)
     explained = np.array([share for *_, share in found])
     return LiftedBoxes(sides_m.mean(axis=1), sides_m[:, 1] - sides_m[:, 0], explained)
 
 
-def _lift(
-    views: RoomViews, rows: Int[np.ndarray, " views"], item: int, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, float]:
-    if not len(rows):
+def _lift(seen: Sightings, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, float]:
+    """Lower and upper corner of an object's box, and the share of rays that meet it."""
+    if not len(seen.ids):
         return np.full(3, -0.5), np.full(3, 0.5), 0.0
-    poses, intrinsics = views.world_to_camera[rows], views.intrinsics[rows]
-    seen = sightings_of(views, rows, item)
-    origins_m, directions = own_rays(seen, poses, intrinsics, views.sides_clear[rows, item], rng)
-    low_m, high_m = _where_to_look(views, rows, item)
+    origins_m, directions = own_rays(seen, rng)
+    low_m, high_m = _where_to_look(seen)
     for cells, reach in GRIDS:
         hull = carve(seen, low_m, high_m, cells, reach)
         where, emptiness = cells_along(hull, origins_m, directions, 3 * cells)
-        in_hull = emptiness <= _limit(emptiness.min(axis=1))
+        # The emptiness at which the hull meets the share `EXPLAINED` of the rays.
+        least = emptiness.min(axis=1)
+        met = least[least <= 1]
+        limit = min(float(np.quantile(met, EXPLAINED)), MOST_EMPTY) if len(met) else MOST_EMPTY
+        in_hull = emptiness <= limit
         first, last = smallest_box(where, in_hull, cells)
         if not in_hull.any():
             break
@@ -91,11 +75,38 @@ def _lift(
     )
 
 
-def _limit(least: Float[np.ndarray, " rays"]) -> float:
-    """The emptiness threshold at which a hull meets the share `EXPLAINED` of the rays; `least` is
-    each ray's lowest emptiness."""
-    met = least[least <= 1]
-    return min(float(np.quantile(met, EXPLAINED)), MOST_EMPTY) if len(met) else MOST_EMPTY
+def cells_along(
+    hull: Hull,
+    origins_m: Float[np.ndarray, "rays 3"],
+    directions: Float[np.ndarray, "rays 3"],
+    samples: int,
+) -> tuple[Int[np.ndarray, "rays samples 3"], Float[np.ndarray, "rays samples"]]:
+    """Cells at evenly spaced samples of rays, from entry to exit, and their emptiness; `NEVER` all
+    along a ray that misses the grid."""
+    near, far = pass_through(origins_m, directions, hull.low_m, hull.high_m)
+    where = np.empty((len(near), samples, 3), dtype=np.int32)
+    emptiness = np.empty((len(near), samples), dtype=np.float32)
+    in_threads(
+        _cells_along, len(near), origins_m, directions, near, far, hull.low_m, hull.cell_m,
+        hull.emptiness, where, emptiness,
+    )  # fmt: skip
+    return where, emptiness
+
+
+def pass_through(
+    origins_m: Float[np.ndarray, "rays 3"],
+    directions: Float[np.ndarray, "rays 3"],
+    low_m: Float[np.ndarray, "*rays 3"],
+    high_m: Float[np.ndarray, "*rays 3"],
+) -> tuple[Float[np.ndarray, " rays"], Float[np.ndarray, " rays"]]:
+    """Distances at which rays enter and leave axis-aligned boxes. A ray that misses leaves no later
+    than it enters, or behind the origin. A ray that starts inside enters at 0."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = np.stack([low_m - origins_m, high_m - origins_m]) / directions
+    # A ray in the plane of a side divides 0 by 0; it counts as inside.
+    near = np.where(np.isnan(ends[0]), -np.inf, ends.min(axis=0)).max(axis=-1)
+    far = np.where(np.isnan(ends[0]), np.inf, ends.max(axis=0)).min(axis=-1)
+    return near.clip(min=0), far
 
 
 def smallest_box(
@@ -123,11 +134,7 @@ def smallest_box(
 
 
 def own_rays(
-    seen: Sightings,
-    poses: Float[np.ndarray, "views 4 4"],
-    intrinsics: Float[np.ndarray, "views 3 3"],
-    sides_clear: Bool[np.ndarray, "views 4"],
-    rng: np.random.Generator,
+    seen: Sightings, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "rays 3"], Float[np.ndarray, "rays 3"]]:
     """Origins and unit directions of rays through an object's pixels.
 
@@ -135,111 +142,76 @@ def own_rays(
     go through the outermost pixel at each side where the object itself ends, rather than where an
     occluder cuts it off; these rays determine the object's extent.
     """
-    each = max(4, RAYS // len(poses))
+    each = max(4, RAYS // len(seen.ids))
     origins, directions = [], []
-    for ids, (x1, y1, x2, y2), pose, camera, clear in zip(
-        seen.ids, seen.boxes_px, poses, intrinsics, sides_clear, strict=True
-    ):
-        v, u = np.nonzero(ids[y1:y2, x1:x2] == seen.own_id)
+    for view, (x1, y1, x2, y2) in enumerate(seen.boxes_px):
+        v, u = np.nonzero(seen.ids[view, y1:y2, x1:x2] == seen.own_id)
         v, u = v + y1, u + x1
-        outermost = np.array([u.argmin(), v.argmin(), u.argmax(), v.argmax()])[clear]
+        ends = np.array([u.argmin(), v.argmin(), u.argmax(), v.argmax()])
+        outermost = ends[seen.sides_clear[view]]
         picked = np.concatenate([rng.integers(len(u), size=each), outermost])
-        rays = pixel_directions(u[picked], v[picked], pose, camera)
-        directions.append(rays)
-        origins.append(np.broadcast_to(camera_centers(pose), rays.shape))
+        directions.append(seen.directions(view, u[picked], v[picked]))
+        eye_m = camera_centers(seen.world_to_camera[view])
+        origins.append(np.broadcast_to(eye_m, directions[-1].shape))
     return np.concatenate(origins).astype(np.float64), np.concatenate(directions)
 
 
-def pixel_directions(
-    u: Real[np.ndarray, " rays"],
-    v: Real[np.ndarray, " rays"],
-    world_to_camera: Float[np.ndarray, "4 4"],
-    intrinsics: Float[np.ndarray, "3 3"],
-) -> Float[np.ndarray, "rays 3"]:
-    """Unit directions, in the room frame, of rays through the centres of pixels."""
-    rays = pixel_rays(np.stack([u, v], axis=-1) + 0.5, world_to_camera, intrinsics)
-    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-
-
-def _where_to_look(
-    views: RoomViews, rows: Int[np.ndarray, " views"], item: int
-) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+def _where_to_look(seen: Sightings) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
     """Lower and upper corner of a cube that contains the object. Its centre is the point nearest to
     the rays through the centres of the object's 2D boxes."""
-    height, width = views.image_size
-    boxes_px = views.boxes[rows, item] * np.array([width, height, width, height])
-    poses, intrinsics = views.world_to_camera[rows], views.intrinsics[rows]
+    height, width = seen.ids.shape[1:]
+    boxes_px = seen.boxes * np.array([width, height, width, height])
     middle_px = (boxes_px[:, :2] + boxes_px[:, 2:]) / 2 - 0.5
-    cameras_m = camera_centers(poses)
+    cameras_m = camera_centers(seen.world_to_camera)
     rays = np.concatenate(
-        [
-            pixel_directions(pixel[:1], pixel[1:], pose, camera)
-            for pixel, pose, camera in zip(middle_px, poses, intrinsics, strict=True)
-        ]
+        [seen.directions(view, pixel[:1], pixel[1:]) for view, pixel in enumerate(middle_px)]
     )
     guess_m = (cameras_m + UNKNOWN_DISTANCE_M * rays).mean(axis=0)
     middle_m = nearest_to_rays(cameras_m, rays, 1e-3, guess_m)
-    spans = (boxes_px[:, 2:] - boxes_px[:, :2]) / intrinsics[:, [0, 1], [0, 1]]
+    spans = (boxes_px[:, 2:] - boxes_px[:, :2]) / seen.intrinsics[:, [0, 1], [0, 1]]
     distances_m = np.linalg.norm(middle_m - cameras_m, axis=-1)
     radius_m = 1.3 * float((np.linalg.norm(spans, axis=-1) / 2 * distances_m).max()) + 0.15
     return middle_m - radius_m, middle_m + radius_m
 
 
-def draw_rays(
-    views: RoomViews,
-    boxes: LiftedBoxes,
-    count: int,
-    margin: float,
-    chosen: Int[np.ndarray, " views"] | None = None,
-    seed: int = 0,
-) -> RayPool:
+def draw_rays(views: RoomViews, boxes: LiftedBoxes, count: int, margin: float) -> RayPool:
     """`count` rays per object, through pixels in and around its mask in every view that shows it.
 
     A pixel of another object shows that the ray is empty up to that object's box; beyond it, this
     object may be hidden. If the other box is unknown, or the pixel is void, the ray carries no
     information. Walls, floor and everything without an id count as background.
 
-    `margin` is the extent of an object's frame, relative to its box; the other arguments are those
+    `margin` is the extent of an object's frame, relative to its box; `views` and `boxes` are those
     of `lift_boxes` and its result.
     """
-    rng = np.random.default_rng([seed, 1])
-    rows = np.arange(len(views.visible)) if chosen is None else chosen
-    pools = [
-        _draw(views, boxes, rows[views.visible[rows, item]], item, count, margin, rng)
-        for item in range(len(views.object_class))
-    ]
-    if not pools:
-        many = np.zeros((0, count, 3), np.float32)
-        return RayPool(many, many, many[..., 0] > 0)
-    return RayPool(*(np.stack(part) for part in zip(*pools, strict=True)))
+    rng = np.random.default_rng([0, 1])
+    objects = len(views.object_class)
+    starts, spans = np.zeros((2, objects, count, 3), np.float32)
+    hits = np.zeros((objects, count), bool)
+    for item in range(objects):
+        found = _draw(Sightings.of(views, item), boxes, count, margin, rng)
+        if found is not None:
+            starts[item], spans[item], hits[item] = found
+    return RayPool(starts, spans, hits)
 
 
 def _draw(
-    views: RoomViews,
-    boxes: LiftedBoxes,
-    rows: Int[np.ndarray, " views"],
-    item: int,
-    count: int,
-    margin: float,
-    rng: np.random.Generator,
-) -> RayPool:
-    nowhere = np.zeros((count, 3), np.float32)
-    nothing = RayPool(nowhere, nowhere, np.zeros(count, bool))
-    if not len(rows):
-        return nothing
-    poses, intrinsics = views.world_to_camera[rows], views.intrinsics[rows]
-    seen = sightings_of(views, rows, item)
-    view, u, v = _pixels_round(views, rows, item, 6 * count, rng)
+    seen: Sightings, boxes: LiftedBoxes, count: int, margin: float, rng: np.random.Generator
+) -> RayPool | None:
+    """The rays of one object; None if none carries information."""
+    if not len(seen.ids):
+        return None
+    item = seen.own_id - 1
+    view, u, v = _pixels_round(seen, 6 * count, rng)
     ids = seen.ids[view, v, u].astype(np.int64)
     directions = np.empty((len(u), 3))
-    for row, (pose, camera) in enumerate(zip(poses, intrinsics, strict=True)):
-        mine = view == row
-        directions[mine] = pixel_directions(u[mine], v[mine], pose, camera)
-    origins_m = camera_centers(poses)[view].astype(np.float64)
-    until_m = np.where((ids == 0) | (ids == item + 1), FAR_M, 0.0)
+    for row in range(len(seen.ids)):
+        directions[view == row] = seen.directions(row, u[view == row], v[view == row])
+    origins_m = camera_centers(seen.world_to_camera)[view].astype(np.float64)
+    until_m = np.where((ids == 0) | (ids == seen.own_id), FAR_M, 0.0)
     # Indexed by id: True for other objects with a known box. Id 0 is background, the last id void.
     has_box = np.concatenate([[False], boxes.explained > 0, [False]])
-    has_box[item + 1] = False
+    has_box[seen.own_id] = False
     other = has_box[ids]
     centers_m = boxes.centers_m[ids[other] - 1]
     its_half_m = 1.05 * boxes.sizes_m[ids[other] - 1] / 2  # a margin for errors of the boxes
@@ -254,10 +226,10 @@ def _draw(
     far = np.minimum(far, until_m)
     useful = np.flatnonzero(far > near)
     if not len(useful):
-        return nothing
+        return None
     near_outline = np.empty(len(useful), bool)
     in_threads(
-        _near_outline, len(useful), view[useful], u[useful], v[useful], views.image_size,
+        _near_outline, len(useful), view[useful], u[useful], v[useful], seen.ids.shape[1:],
         seen.boxes_px, seen.own_before, seen.table_starts, near_outline,
     )  # fmt: skip
     weights = near_outline.astype(np.float64)
@@ -271,29 +243,42 @@ def _draw(
     return RayPool(
         (origin + near[drawn, None] * ray).astype(np.float32),
         ((far - near)[drawn, None] * ray).astype(np.float32),
-        ids[drawn] == item + 1,
+        ids[drawn] == seen.own_id,
     )
 
 
 def _pixels_round(
-    views: RoomViews,
-    rows: Int[np.ndarray, " views"],
-    item: int,
-    count: int,
-    rng: np.random.Generator,
+    seen: Sightings, count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """View, column and row of random pixels in the object's 2D boxes, widened by a sixth and 8
     pixels."""
-    height, width = views.image_size
+    height, width = seen.ids.shape[1:]
     size = np.array([width, height])
-    boxes_px = views.boxes[rows, item].reshape(-1, 2, 2) * size
+    boxes_px = seen.boxes.reshape(-1, 2, 2) * size
     wider = 8 + (boxes_px[:, 1] - boxes_px[:, 0]) / 6
     low = (boxes_px[:, 0] - wider).clip(0)
     high = np.minimum(boxes_px[:, 1] + wider, size)
-    view = np.repeat(np.arange(len(rows)), -(-count // len(rows)))
+    view = np.repeat(np.arange(len(seen.ids)), -(-count // len(seen.ids)))
     places = low[view] + rng.random((len(view), 2)) * (high - low)[view]
     u, v = np.minimum(places.astype(np.int64), size - 1).T
     return view, u, v
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _cells_along(first, last, origins, directions, near, far, low_m, cell_m, grid, where, found):
+    cells, samples = grid.shape[0], found.shape[1]
+    for ray in range(first, last):
+        met = far[ray] > near[ray]
+        start, span = (near[ray], far[ray] - near[ray]) if met else (0.0, 0.0)
+        for i in range(samples):
+            depth_m = start + span * ((i + 0.5) / samples)
+            for axis in range(3):
+                point_m = origins[ray, axis] + depth_m * directions[ray, axis]
+                cell = (point_m - low_m[axis]) / cell_m[axis]
+                where[ray, i, axis] = int(min(max(cell, 0.0), cells - 1.0))
+            x, y, z = where[ray, i]
+            found[ray, i] = grid[x, y, z] if met else NEVER
 
 
 @njit(cache=True, nogil=True)

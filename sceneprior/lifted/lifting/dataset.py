@@ -1,12 +1,23 @@
-"""The rooms of a split with their lifted boxes and shapes, in memory, for training in 3D."""
+"""The rooms of a split with what is lifted from their masks, in memory, for training in 3D.
 
-from collections.abc import Sequence
-from dataclasses import replace
+Boxes, shapes, walls and parts are lifted once and cached in files beside the shards. A file is
+found again when its inputs or its version changes, and is left out if the folder is not writable.
+"""
+
+import contextlib
+import hashlib
+import io
+import zipfile
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from rich.console import Console
+from rich.progress import track
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
@@ -14,23 +25,53 @@ from sceneprior.core.boxes import turn_boxes
 from sceneprior.core.classes import VOID
 from sceneprior.core.dataset import BLANK, RoomDataset, allowed_views
 from sceneprior.core.errors import ShardError
+from sceneprior.core.files import write_whole
 from sceneprior.core.observations import RoomViews
-from sceneprior.core.parts import filled_cells
-from sceneprior.core.shards import Shard
-from sceneprior.core.wall_lines import Wall
-from sceneprior.lifted.lifting import HANGS_M, RayPool, ShapeGrid
-from sceneprior.lifted.lifting.cache import LiftedCache, fingerprint
+from sceneprior.core.parts import Parts, filled_cells
+from sceneprior.core.shards import Shard, iterate_rooms
+from sceneprior.core.views import Batch
+from sceneprior.core.wall_lines import Wall, find_walls
+from sceneprior.lifted.lifting import HANGS_M, LiftedBoxes, RayPool, ShapeGrid
 from sceneprior.lifted.prototypes import Prototypes, choose_prototypes, turn_posed
-from sceneprior.lifted.rooms import LiftedRooms
+
+VERSION = 5
+"""Version of the cached boxes, hulls, rays and walls. Increase a version when results change."""
+PARTS_VERSION = 1
+"""Version of the cached parts: increase it when `prototype_fitting.py`, `part_fit.py` and what it
+imports, `ALIKE` or `HANGS_M` change; delete `lifted_parts_*.npz` while trying settings."""
+RAYS_KEPT = 1024
+"""Number of rays per object from which its shape is found."""
+
+
+@dataclass(frozen=True)
+class LiftedRooms(Batch):
+    """Tracked objects of a batch of rooms, lifted to 3D from masks alone.
+
+    Objects are padded to the largest room's count.
+    """
+
+    room_index: Int[Tensor, " rooms"]
+    """Row of each room in the data set, which is also the row of its latent vector."""
+    object_class: Int[Tensor, "rooms objects"]
+    """Index into the label set; 0 where `is_object` is false."""
+    is_object: Bool[Tensor, "rooms objects"]
+    """False for padding; the first n entries of a room with n tracked objects are true."""
+    is_lifted: Bool[Tensor, "rooms objects"]
+    """True if the object's box is known, because some view shows the object."""
+    boxes_m: Float[Tensor, "rooms objects 6"]
+    """Axis-aligned boxes in the room frame: centre x, y, z, then full extents."""
+    looks: Int[Tensor, "rooms objects"] | None = None
+    """Look (prototype * 8 + pose) nearest to the lifted shape (`lifted/prototypes.py`); -1 if there
+    is none."""
+    room_ids: tuple[str, ...] = ()
 
 
 class LiftedDataset(RoomDataset):
     """Tracked objects of a split with the 3D boxes estimated from their masks; rows and turns are
     those of `ViewDataset`.
 
-    Visual hulls, rays and parts are lifted as well if `shape` gives the hulls' grid.
-    `view_fraction` and `seed` are those of `ViewDataset`. If no object is visible in two views, a
-    `ShardError` says so.
+    Visual hulls and parts are represented on the grid `shape`. `view_fraction` and `seed` are those
+    of `ViewDataset`. If no object is visible in two views, a `ShardError` says so.
     """
 
     counted = "tracked objects"
@@ -39,9 +80,9 @@ class LiftedDataset(RoomDataset):
         self,
         folder: Path,
         split: str,
+        shape: ShapeGrid,
         rotations: int = 1,
         view_fraction: float = 1.0,
-        shape: ShapeGrid | None = None,
         seed: int = 0,
     ):
         super().__init__(rotations)
@@ -57,12 +98,28 @@ class LiftedDataset(RoomDataset):
             allowed_views(seed, index, len(room.visible), view_fraction)
             for index, room in enumerate(rooms)
         ]
-        self._cache = LiftedCache(folder, split, chosen, fingerprint(rooms, checksums, chosen))
-        counts = [len(room.object_class) for room in rooms]
-        self.boxes = self._cache.boxes(counts)
-        self.max_objects = max(counts)
+        self.counts = [len(room.object_class) for room in rooms]
+        self.max_objects = max(self.counts)
         self.object_classes = np.concatenate([room.object_class for room in rooms]).astype(np.int64)
         """Classes of all objects, room after room."""
+        self._shape, self._parts_file = shape, folder / f"lifted_parts_{split}.npz"
+        inputs = _fingerprint(rooms, checksums, chosen)
+        self._key = f"{inputs} {VERSION} {shape.cells} {shape.margin}"
+        found = _cached(
+            folder / f"lifted_{split}.npz",
+            self._key,
+            lambda: _lift_rooms(folder, split, chosen, shape),
+        )
+        self.boxes = LiftedBoxes(*(found[name] for name in LiftedBoxes._fields))
+        """Boxes of all objects, room after room."""
+        self.rays = RayPool(*(found[name] for name in RayPool._fields))
+        """Rays around the masks of all objects, room after room."""
+        self.walls = [
+            [Wall(row[:2], row[2:4], row[4:6], float(row[6])) for row in part]
+            for part in np.split(found["walls"], np.cumsum(found["wall_counts"])[:-1])
+        ]
+        """Walls of each room; none if its shard has no stuff."""
+        self._bits = found["bits"]
         if not self.usable.any():
             views = sum(map(len, chosen))
             raise ShardError(
@@ -73,60 +130,64 @@ class LiftedDataset(RoomDataset):
             )
         self._rooms = LiftedRooms(
             room_index=torch.arange(len(rooms)),
-            object_class=_padded([room.object_class.astype(np.int64) for room in rooms]),
-            is_object=_padded([np.ones(count, dtype=bool) for count in counts]),
-            is_lifted=_padded([boxes.explained > 0 for boxes in self.boxes]),
-            boxes_m=_padded(
-                [np.hstack([b.centers_m, b.sizes_m]).astype(np.float32) for b in self.boxes]
-            ),
+            object_class=self._padded(self.object_classes),
+            is_object=self._padded(np.ones(len(self.object_classes), dtype=bool)),
+            is_lifted=self._padded(self.boxes.explained > 0),
+            boxes_m=self._padded(np.hstack(self.boxes[:2]).astype(np.float32)),
         )
-        self._shape = shape
-        if shape is not None:
-            found = self._cache.shapes(self.boxes, shape)
-            self._bits = found["bits"]
-            self.rays = RayPool(*(found[name] for name in RayPool._fields))
-            """Rays around the masks of all objects, room after room."""
+
+    def _padded(self, values: np.ndarray, value: int = 0) -> Tensor:
+        """An array of all objects as one tensor by room."""
+        parts = torch.from_numpy(values).split(self.counts)
+        return pad_sequence(list(parts), batch_first=True, padding_value=value)
 
     @property
     def usable(self) -> Bool[np.ndarray, " objects"]:
         """True for objects with a label and a lifted box, and so a shape; room after room."""
-        known = np.concatenate([room.explained > 0 for room in self.boxes])
-        return known & (self.object_classes != VOID)
+        return (self.boxes.explained > 0) & (self.object_classes != VOID)
 
     @property
     def sizes_m(self) -> Float[np.ndarray, "objects 3"]:
         """Full extents, room after room; 1 m for objects that are not usable."""
-        sizes_m = np.concatenate([room.sizes_m for room in self.boxes])
-        return np.where(self.usable[:, None], sizes_m, 1.0)
+        return np.where(self.usable[:, None], self.boxes.sizes_m, 1.0)
+
+    def hulls(self) -> Bool[np.ndarray, "objects x y z"]:
+        """The visual hulls of all objects, room after room; see `lift_shapes`."""
+        cells = self._shape.cells
+        flat = np.unpackbits(self._bits, axis=1, count=cells**3).view(bool)
+        return flat.reshape(-1, cells, cells, cells)
 
     def find_prototypes(self, most: int) -> Prototypes:
         """Choose at most `most` prototypes, made of parts, that represent all usable objects."""
-        # Imported only where something is lifted, here and below, since Numba is slow to import.
-        from sceneprior.lifted.lifting.prototype_fitting import fit_prototypes
-
-        assert self._shape is not None, "opened with shapes"
         hulls, sizes_m, labels = self.hulls(), self.sizes_m, self.object_classes
         items, common = choose_prototypes(hulls, sizes_m, labels, self.usable, most)
-        margin = self._shape.margin
-        bottoms_m = np.concatenate(
-            [room.centers_m[:, 1] - room.sizes_m[:, 1] / 2 for room in self.boxes]
-        )
-        hangs = bottoms_m > HANGS_M
-        parts = self._cache.parts(
-            items,
-            self._shape,
-            lambda: fit_prototypes(
-                items, hulls, self.rays, sizes_m, labels, self.usable, hangs, margin
-            ),
-        )
-        grids = [filled_cells(each, self._shape.cells, margin) for each in parts]
+        hangs = self.boxes.centers_m[:, 1] - self.boxes.sizes_m[:, 1] / 2 > HANGS_M
+
+        def fit() -> dict[str, np.ndarray]:
+            # Imported only where something is lifted, here and below: Numba is slow to import.
+            from sceneprior.lifted.lifting.prototype_fitting import fit_prototypes
+
+            found = fit_prototypes(
+                items, hulls, self.rays, sizes_m, labels, self.usable, hangs, self._shape.margin
+            )
+            counts = np.array([(len(each.kind), len(each.outline)) for each in found])
+            return _joined(each._asdict() for each in found) | {"counts": counts}
+
+        chosen = hashlib.sha256(items.tobytes()).hexdigest()
+        saved = _cached(self._parts_file, f"{self._key} {PARTS_VERSION} {chosen}", fit)
+        solids, corners = np.cumsum(saved["counts"], axis=0)[:-1].T
+        columns = [
+            np.split(saved[name], corners if name == "outline" else solids)
+            for name in Parts._fields
+        ]
+        parts = tuple(Parts(*each) for each in zip(*columns, strict=True))
+        grids = [filled_cells(each, self._shape.cells, self._shape.margin) for each in parts]
         return Prototypes(parts, np.stack(grids), sizes_m[items], labels[items], common)
 
     def posed_prototypes(self, prototypes: Prototypes) -> Int[np.ndarray, " objects"]:
         """The look of each object; -1 if it is not usable or its class has no prototype."""
         from sceneprior.lifted.lifting.prototype_fitting import explain_rays
 
-        assert self._shape is not None, "opened with shapes"
         margin = self._shape.margin
         looks = explain_rays(prototypes, self.rays, self.sizes_m, self.object_classes, margin)
         return np.where(self.usable, looks, -1)
@@ -137,21 +198,8 @@ class LiftedDataset(RoomDataset):
         The prototypes should come from the checkpoint, if there is one: recomputed on another
         processor, they may differ.
         """
-        counts = self._rooms.is_object.sum(dim=1).tolist()
-        looks = torch.from_numpy(self.posed_prototypes(prototypes)).split(counts)
-        padded = pad_sequence(list(looks), batch_first=True, padding_value=-1)
-        self._rooms = replace(self._rooms, looks=padded.to(self._rooms.is_object.device))
-
-    def walls(self) -> list[list[Wall]]:
-        """Walls of each room, found in its masks; none if its shard has no stuff."""
-        return self._cache.walls()
-
-    def hulls(self) -> Bool[np.ndarray, "objects x y z"]:
-        """The visual hulls of all objects, room after room; see `lift_shapes`."""
-        assert self._shape is not None, "opened with shapes"
-        cells = self._shape.cells
-        flat = np.unpackbits(self._bits, axis=1, count=cells**3).view(bool)
-        return flat.reshape(-1, cells, cells, cells)
+        looks = self._padded(self.posed_prototypes(prototypes), -1)
+        self._rooms = replace(self._rooms, looks=looks.to(self._rooms.is_object.device))
 
     def to(self, device: torch.device | str) -> "LiftedDataset":
         """Move all boxes and looks to `device`, on which batches are then assembled."""
@@ -183,6 +231,73 @@ class LiftedDataset(RoomDataset):
         )
 
 
-def _padded(parts: Sequence[np.ndarray]) -> Tensor:
-    """Per-room arrays of objects, padded to one tensor."""
-    return pad_sequence([torch.from_numpy(part) for part in parts], batch_first=True)
+def _lift_rooms(
+    folder: Path, split: str, chosen: Sequence[Int[np.ndarray, " views"]], shape: ShapeGrid
+) -> dict[str, np.ndarray]:
+    """The fields of `LiftedBoxes` and of a `RayPool` of all objects of a split, their visual hulls
+    (`bits`, eight cells per byte), and the rooms' walls, from the `chosen` views of each room."""
+    from sceneprior.lifted.lifting.boxes import draw_rays, lift_boxes
+    from sceneprior.lifted.lifting.hulls import lift_shapes
+
+    found = []
+    progress = track(chosen, "lifting objects from masks (rooms)", console=Console(stderr=True))
+    for views, (shard, room_id) in zip(progress, iterate_rooms(folder, split), strict=True):
+        room = shard.read_room(room_id, images=True)
+        walls = find_walls(room, views)[0] if shard.has_stuff(room_id) else ()
+        allowed = np.isin(np.arange(len(room.visible)), views)
+        room = replace(room, visible=room.visible & allowed[:, None])
+        boxes = lift_boxes(room)
+        hulls = lift_shapes(room, boxes, shape).reshape(-1, shape.cells**3)
+        rays = draw_rays(room, boxes, RAYS_KEPT, shape.margin)
+        half = {name: getattr(rays, name).astype(np.float16) for name in ("starts", "spans")}
+        found.append(
+            boxes._asdict() | half | {
+                "hits": rays.hits,
+                "bits": np.packbits(hulls, axis=1),
+                "walls": np.array([np.hstack(wall) for wall in walls]).reshape(-1, 7),
+                "wall_counts": np.array([len(walls)]),
+            }
+        )  # fmt: skip
+    return _joined(found)
+
+
+def _cached(
+    path: Path, key: str, find: Callable[[], dict[str, np.ndarray]]
+) -> dict[str, np.ndarray]:
+    """Read the arrays cached in a file under this key. If they are missing, compute them, and cache
+    them if the file is writable."""
+    try:
+        with np.load(path) as saved:
+            if str(saved["key"]) == key:
+                return {name: saved[name] for name in saved.files}
+    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile):
+        pass  # missing or damaged: computed again
+    found = find()
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, key=np.array(key), **found)
+    if path.parent.is_dir():  # no folder is created
+        with contextlib.suppress(OSError):  # a read-only folder gets no cache
+            write_whole(path, buffer.getvalue())
+    return found
+
+
+def _fingerprint(
+    rooms: Sequence[RoomViews], checksums: Sequence[str | None], chosen: Sequence[np.ndarray]
+) -> str:
+    """Hash of everything from which boxes and shapes are computed. A room's checksum covers its
+    images; for old shards without checksums, measurements taken from the images replace it."""
+    summary = hashlib.sha256(b"lifted 2")
+    for room, checksum, views in zip(rooms, checksums, chosen, strict=True):
+        summary.update(f"{room.room_id} {checksum}".encode())
+        for array in (
+            room.object_class, room.boxes, room.mask_pixels, room.sides_clear,
+            room.world_to_camera, room.intrinsics, views,
+        ):  # fmt: skip
+            summary.update(np.ascontiguousarray(array).data)
+    return summary.hexdigest()
+
+
+def _joined(items: Iterable[dict[str, Any]]) -> dict[str, np.ndarray]:
+    """Arrays of the same names, concatenated."""
+    items = list(items)
+    return {name: np.concatenate([each[name] for each in items]) for name in items[0]}

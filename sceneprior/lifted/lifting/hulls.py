@@ -8,9 +8,10 @@ the smallest box in it that still explains every mask.
 from typing import NamedTuple, no_type_check
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Integer
+from jaxtyping import Bool, Float, Int, Integer, Real
 from numba import njit
 
+from sceneprior.core.cameras import pixel_rays
 from sceneprior.core.observations import RoomViews
 from sceneprior.lifted.lifting import LiftedBoxes, ShapeGrid
 from sceneprior.render.silhouettes.cpu.kernels import in_threads
@@ -46,6 +47,44 @@ class Sightings(NamedTuple):
     world_to_image: Float[np.ndarray, "views 3 4"]
     """Intrinsics times `world_to_camera`."""
     focal_px: Float[np.ndarray, " views"]
+    boxes: Float[np.ndarray, "views 4"]
+    """2D boxes, relative to the image's size."""
+    sides_clear: Bool[np.ndarray, "views 4"]
+    """True where the object itself ends at a side of its 2D box; see `RoomViews`."""
+    world_to_camera: Float[np.ndarray, "views 4 4"]
+    intrinsics: Float[np.ndarray, "views 3 3"]
+
+    @classmethod
+    def of(cls, views: RoomViews, item: int) -> "Sightings":
+        """The views of a room, read with its images, that show an object."""
+        assert views.instance_ids is not None, "lifting reads images"
+        rows = np.flatnonzero(views.visible[:, item])
+        ids, boxes = views.instance_ids[rows], views.boxes[rows, item]
+        height, width = views.image_size
+        size = np.array([width, height, width, height])
+        # Clipped as a safeguard: compiled code checks no index.
+        boxes_px = np.rint(np.nan_to_num(boxes) * size).clip(0, size).astype(np.int64)
+        boxes_px[:, 2:] = np.maximum(boxes_px[:, 2:], boxes_px[:, :2])
+        tables = [np.zeros(0, np.int32)]
+        for image, (x1, y1, x2, y2) in zip(ids, boxes_px, strict=True):
+            own = (image[y1:y2, x1:x2] == item + 1).cumsum(0, np.int32).cumsum(1, np.int32)
+            tables.append(np.pad(own, ((1, 0), (1, 0))).ravel())
+        starts = np.cumsum([len(table) for table in tables])[:-1]
+        poses, intrinsics = views.world_to_camera[rows], views.intrinsics[rows]
+        exact = intrinsics.astype(np.float64)
+        matrices = exact @ poses[:, :3].astype(np.float64)
+        return cls(
+            ids, item + 1, boxes_px, np.concatenate(tables), starts, matrices,
+            exact[:, 0, 0].copy(), boxes, views.sides_clear[rows, item], poses, intrinsics,
+        )  # fmt: skip
+
+    def directions(
+        self, view: int, u: Real[np.ndarray, " rays"], v: Real[np.ndarray, " rays"]
+    ) -> Float[np.ndarray, "rays 3"]:
+        """Unit directions, in the room frame, of rays through the centres of a view's pixels."""
+        places = np.stack([u, v], axis=-1) + 0.5
+        rays = pixel_rays(places, self.world_to_camera[view], self.intrinsics[view])
+        return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
 
 class Hull(NamedTuple):
@@ -62,26 +101,6 @@ class Hull(NamedTuple):
     def cell_m(self) -> Float[np.ndarray, "3"]:
         """Edge lengths of a cell."""
         return (self.high_m - self.low_m) / self.emptiness.shape[0]
-
-
-def sightings_of(views: RoomViews, rows: Int[np.ndarray, " views"], item: int) -> Sightings:
-    """The data that `carve` needs about an object, from the `rows` of a room's views that show
-    it."""
-    assert views.instance_ids is not None, "lifting reads images"
-    ids = views.instance_ids[rows]
-    height, width = views.image_size
-    size = np.array([width, height, width, height])
-    # Clipped as a safeguard: compiled code checks no index.
-    boxes_px = np.rint(np.nan_to_num(views.boxes[rows, item]) * size).clip(0, size).astype(np.int64)
-    boxes_px[:, 2:] = np.maximum(boxes_px[:, 2:], boxes_px[:, :2])
-    tables = []
-    for image, (x1, y1, x2, y2) in zip(ids, boxes_px, strict=True):
-        own = (image[y1:y2, x1:x2] == item + 1).cumsum(0, np.int32).cumsum(1, np.int32)
-        tables.append(np.pad(own, ((1, 0), (1, 0))).ravel())
-    table, starts = np.concatenate(tables), np.cumsum([0, *map(len, tables)])[:-1]
-    intrinsics = views.intrinsics[rows].astype(np.float64)
-    matrices = intrinsics @ views.world_to_camera[rows, :3].astype(np.float64)
-    return Sightings(ids, item + 1, boxes_px, table, starts, matrices, intrinsics[:, 0, 0].copy())
 
 
 def carve(
@@ -109,62 +128,23 @@ def carve(
 
 
 def lift_shapes(
-    views: RoomViews,
-    boxes: LiftedBoxes,
-    shape: ShapeGrid,
-    chosen: Int[np.ndarray, " views"] | None = None,
+    views: RoomViews, boxes: LiftedBoxes, shape: ShapeGrid
 ) -> Bool[np.ndarray, "objects x y z"]:
     """The visual hull of each of a room's objects, on a grid in the frame of its box.
 
     True in cells that the object may fill, never outside the box; all False for an object without
-    a box. `views` and `chosen` are those of `lift_boxes`.
+    a box. `views` are those of `lift_boxes`.
     """
-    rows = np.arange(len(views.visible)) if chosen is None else chosen
     cells, margin = shape.cells, shape.margin
     grids = np.zeros((len(views.object_class), cells, cells, cells), dtype=bool)
     # Cells whose centres lie in the box.
     inside = np.abs((np.arange(cells) + 0.5) / cells - 0.5) * margin < 0.5
-    for item in np.flatnonzero(boxes.explained > 0):
-        seen = sightings_of(views, rows[views.visible[rows, item]], int(item))
+    for item in np.flatnonzero(boxes.explained > 0).tolist():
         half_m = margin * boxes.sizes_m[item] / 2
         low_m, high_m = boxes.centers_m[item] - half_m, boxes.centers_m[item] + half_m
-        hull = carve(seen, low_m, high_m, cells, REACH, EMPTY)
+        hull = carve(Sightings.of(views, item), low_m, high_m, cells, REACH, EMPTY)
         grids[item] = (hull.emptiness <= EMPTY) & inside & inside[:, None] & inside[:, None, None]
     return grids
-
-
-def cells_along(
-    hull: Hull,
-    origins_m: Float[np.ndarray, "rays 3"],
-    directions: Float[np.ndarray, "rays 3"],
-    samples: int,
-) -> tuple[Int[np.ndarray, "rays samples 3"], Float[np.ndarray, "rays samples"]]:
-    """Cells at evenly spaced samples of rays, from entry to exit, and their emptiness; `NEVER` all
-    along a ray that misses the grid."""
-    near, far = pass_through(origins_m, directions, hull.low_m, hull.high_m)
-    where = np.empty((len(near), samples, 3), dtype=np.int32)
-    emptiness = np.empty((len(near), samples), dtype=np.float32)
-    in_threads(
-        _cells_along, len(near), origins_m, directions, near, far, hull.low_m, hull.cell_m,
-        hull.emptiness, where, emptiness,
-    )  # fmt: skip
-    return where, emptiness
-
-
-def pass_through(
-    origins_m: Float[np.ndarray, "rays 3"],
-    directions: Float[np.ndarray, "rays 3"],
-    low_m: Float[np.ndarray, "*rays 3"],
-    high_m: Float[np.ndarray, "*rays 3"],
-) -> tuple[Float[np.ndarray, " rays"], Float[np.ndarray, " rays"]]:
-    """Distances at which rays enter and leave axis-aligned boxes. A ray that misses leaves no later
-    than it enters, or behind the origin. A ray that starts inside enters at 0."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ends = np.stack([low_m - origins_m, high_m - origins_m]) / directions
-    # A ray in the plane of a side divides 0 by 0; it counts as inside.
-    near = np.where(np.isnan(ends[0]), -np.inf, ends.min(axis=0)).max(axis=-1)
-    far = np.where(np.isnan(ends[0]), np.inf, ends.max(axis=0)).min(axis=-1)
-    return near.clip(min=0), far
 
 
 # no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.
@@ -234,20 +214,3 @@ def _carve(
                 share = max(past[j, k] - 0.5, 0.0) / (own[j, k] + past[j, k])
                 never = own[j, k] < 2 or past[j, k] > enough
                 emptiness[i, j, k] = NEVER if never else share
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _cells_along(first, last, origins, directions, near, far, low_m, cell_m, grid, where, found):
-    cells, samples = grid.shape[0], found.shape[1]
-    for ray in range(first, last):
-        met = far[ray] > near[ray]
-        start, span = (near[ray], far[ray] - near[ray]) if met else (0.0, 0.0)
-        for i in range(samples):
-            depth_m = start + span * ((i + 0.5) / samples)
-            for axis in range(3):
-                point_m = origins[ray, axis] + depth_m * directions[ray, axis]
-                cell = (point_m - low_m[axis]) / cell_m[axis]
-                where[ray, i, axis] = int(min(max(cell, 0.0), cells - 1.0))
-            x, y, z = where[ray, i]
-            found[ray, i] = grid[x, y, z] if met else NEVER

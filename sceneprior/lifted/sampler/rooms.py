@@ -65,10 +65,9 @@ class SamplerRooms:
         Only common prototypes are used, since rare prototypes are often errors of lifting.
         """
         lifted, prototypes = self._lifted, prototypes.common_alone()
-        counts = [len(room.explained) for room in lifted.boxes]
-        boxes_m = np.concatenate([np.hstack([b.centers_m, b.sizes_m]) for b in lifted.boxes])
+        boxes_m = np.hstack(lifted.boxes[:2])
         looks = lifted.posed_prototypes(prototypes)
-        rows = np.split(np.arange(len(looks)), np.cumsum(counts)[:-1])
+        rows = np.split(np.arange(len(looks)), np.cumsum(lifted.counts)[:-1])
         kept = [torch.from_numpy(row[looks[row] >= 0]) for row in rows]
 
         def padded(values: np.ndarray) -> Tensor:
@@ -84,7 +83,7 @@ class SamplerRooms:
         )
         walls = [
             _walls_of(*each)
-            for each in zip(lifted.walls(), rectangles_of(self.rooms).numpy(), strict=True)
+            for each in zip(lifted.walls, rectangles_of(self.rooms).numpy(), strict=True)
         ]
         self.rooms = replace(self.rooms, walls_m=torch.tensor(walls, dtype=torch.float32))
         return self

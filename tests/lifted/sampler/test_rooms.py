@@ -35,8 +35,8 @@ def with_looks(lifted: LiftedDataset) -> SamplerRooms:
 def test_objects_without_a_label_or_a_box_are_left_out():
     lifted = lifted_rooms()
     lifted.object_classes[0] = 0
-    lifted.boxes[1].explained[2] = 0
-    lifted.boxes[1].sizes_m[2] = 0
+    lifted.its_boxes[1].explained[2] = 0
+    lifted.its_boxes[1].sizes_m[2] = 0
     found = with_looks(lifted).rooms
     assert found.is_object.sum(dim=1).tolist()[:2] == [1, 2]
     assert found.object_class[0, 0] == 2
@@ -76,7 +76,7 @@ def test_rectangles_end_at_walls_near_the_furniture():
     lifted = lifted_rooms()
     middle, extents = rectangles_of(sampler_rooms().rooms)[0].double().numpy().reshape(2, 2)
     (x1, z1), (x2, z2) = middle - extents / 2, middle + extents / 2
-    lifted.its_walls[0] = [
+    lifted.walls[0] = [
         wall((x1 - 0.3, z1), (x1 - 0.3, z2), (1, 0)),
         wall((x1 - 0.1, z1), (x1 - 0.1, z2), (1, 0)),  # nearer
         wall((x1 - 0.05, z2 + 0.1), (x1 - 0.05, z2 + 1), (1, 0)),  # beside the furniture
@@ -150,11 +150,11 @@ def test_shuffling_keeps_the_set_and_puts_padding_last(rooms):
 def test_classes_may_meet_that_do_often_enough():
     lifted = lifted_rooms(12)
     for room in (1, 3, 5):  # of six with a third object: its box stands in the second's
-        lifted.boxes[room].centers_m[2] = lifted.boxes[room].centers_m[1]
+        lifted.its_boxes[room].centers_m[2] = lifted.its_boxes[room].centers_m[1]
     found = with_looks(lifted).may_meet(CLASSES)
     assert found.nonzero().tolist() == [[2, 3], [3, 2]]
-    lifted.boxes[1].centers_m[2] += 5
-    lifted.boxes[3].centers_m[2] += 5
+    lifted.its_boxes[1].centers_m[2] += 5
+    lifted.its_boxes[3].centers_m[2] += 5
     assert not with_looks(lifted).may_meet(CLASSES).any()
 
 
