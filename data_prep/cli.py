@@ -277,7 +277,7 @@ def inspect(
     """
     from rich.console import Console
 
-    from data_prep.inspection.sheet import draw_sheet
+    from data_prep.inspection.pictures import draw_sheet
     from data_prep.inspection.tables import count_tables, room_table
     from sceneprior.core.errors import InputError
     from sceneprior.core.files import write_whole

@@ -86,8 +86,7 @@ OWNERS = {
     "sklearn": ["sceneprior/evaluation/", "sceneprior/lifted/sampler/prototype_statistics"],
     "scipy.optimize": [
         "sceneprior/core/boxes.py", "sceneprior/lifted/shape_morphing.py",
-        "sceneprior/paper/matching.py",
-        "sceneprior/evaluation/", "data_prep/inspection/causes.py",
+        "sceneprior/paper/matching.py", "sceneprior/evaluation/",
     ],
     "cv2": ["data_prep/readers/posed/cameras.py", "sceneprior/evaluation/metrics/"],
     "viser": ["sceneprior/apps/viewer/"],

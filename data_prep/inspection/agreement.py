@@ -1,6 +1,5 @@
 """Agreement between the projected 3D objects of a room's ground truth and their 2D masks."""
 
-import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -43,11 +42,6 @@ class Hull(NamedTuple):
     edges: np.ndarray
     """(E, 2)"""
 
-    @property
-    def middle_m(self) -> np.ndarray:
-        """Centre of the axis-aligned bounding box."""
-        return (self.points_m.min(axis=0) + self.points_m.max(axis=0)) / 2
-
 
 class Body(NamedTuple):
     """An object in the room frame: its mesh, or its 3D box."""
@@ -55,8 +49,8 @@ class Body(NamedTuple):
     kind: str
     """A key of `KINDS`."""
     hull: Hull
-    unoccluded: np.ndarray | None = None
-    """(T,) bool, as in `RoomGroundTruth`; None if only tracked objects can occlude it."""
+    unoccluded: np.ndarray | bool = True
+    """(T,) bool, as in `RoomGroundTruth`; True if only tracked objects can occlude it."""
 
 
 class Room(NamedTuple):
@@ -117,7 +111,14 @@ def true_bodies(
                 hull = hull_of_model(model_path(shards, model_id))
                 placed = to_camera(hull.points_m, truth.model_to_room[k].astype(np.float64))
                 body = Body("mesh", Hull(placed, hull.edges))
-                problems += _box_problem(k, placed, truth)
+                half = truth.sizes_m[k].astype(np.float64) / 2
+                stored = np.stack([truth.centers_m[k] - half, truth.centers_m[k] + half])
+                off = np.abs(stored - [placed.min(axis=0), placed.max(axis=0)]).max()
+                if off > _BOX_SLACK_M + 1e-5 * np.abs(stored).max():
+                    problems.append(
+                        f"the 3D box of object {k} differs by {off:.3f} m from the box around its "
+                        "placed mesh"
+                    )
             except ShardError as error:
                 body = None
                 problems.append(str(error).removesuffix("."))
@@ -127,13 +128,26 @@ def true_bodies(
     return bodies[: len(views.object_class)], problems
 
 
-def _box_problem(k: int, points: np.ndarray, truth: RoomGroundTruth) -> list[str]:
-    half = truth.sizes_m[k].astype(np.float64) / 2
-    stored = np.stack([truth.centers_m[k] - half, truth.centers_m[k] + half])
-    off = np.abs(stored - np.stack([points.min(axis=0), points.max(axis=0)])).max()
-    if off <= _BOX_SLACK_M + 1e-5 * np.abs(stored).max():
-        return []
-    return [f"the 3D box of object {k} differs by {off:.3f} m from the box around its placed mesh"]
+def project_edges(hull: Hull, world_to_camera: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    """Edges as lines in the images, (..., E, 4) u1, v1, u2, v2 in pixels, clipped at the near
+    plane; NaN for an edge that does not reach beyond it.
+
+    Example: a line that begins 1 m behind the camera is visible from the near plane on.
+
+        >>> line = Hull(np.array([[0.0, 0, -1], [0.2, 0, 2]]), np.array([[0, 1]]))
+        >>> project_edges(line, np.eye(4), np.diag([10.0, 10, 1])).round(6).tolist()
+        [[14.0, 0.0, 1.0, 0.0]]
+    """
+    points = to_camera(hull.points_m.astype(np.float64), world_to_camera.astype(np.float64))
+    ends = points[..., hull.edges, :]
+    others = ends[..., ::-1, :]
+    # An end before the near plane moves along its edge to the plane.
+    near, far = ends[..., 2:], others[..., 2:]
+    clipped = (near < NEAR_M) & (far >= NEAR_M)
+    share = np.where(clipped, (NEAR_M - near) / np.where(clipped, far - near, 1.0), 0.0)
+    ends = np.where((near < NEAR_M) & ~clipped, np.nan, ends + share * (others - ends))
+    pixels = to_pixels(ends.reshape(*ends.shape[:-3], -1, 3), intrinsics.astype(np.float64))
+    return pixels.reshape(*ends.shape[:-2], 4)
 
 
 def boxes_around(hull: Hull, world_to_camera: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
@@ -141,21 +155,10 @@ def boxes_around(hull: Hull, world_to_camera: np.ndarray, intrinsics: np.ndarray
 
     (T, 4) x1, y1, x2, y2 in pixels, of the part beyond the near plane; NaN if there is none.
     """
-    camera = to_camera(hull.points_m, world_to_camera.astype(np.float64))
-    lenses = intrinsics.astype(np.float64)
-    ahead = camera[..., 2] >= NEAR_M
-    pixels = to_pixels(np.where(ahead[..., None], camera, np.nan), lenses)
-    with warnings.catch_warnings():  # nanmin warns if the whole body is behind the camera
-        warnings.simplefilter("ignore", RuntimeWarning)
-        boxes = np.concatenate([np.nanmin(pixels, axis=1), np.nanmax(pixels, axis=1)], axis=1)
-    for view in np.flatnonzero(ahead.any(axis=1) & ~ahead.all(axis=1)):
-        crossing = hull.edges[ahead[view, hull.edges].sum(axis=1) == 1]
-        a, b = camera[view, crossing[:, 0]], camera[view, crossing[:, 1]]
-        share = (NEAR_M - a[:, 2:]) / (b[:, 2:] - a[:, 2:])
-        cut = to_pixels(a + (b - a) * share, lenses[view])
-        boxes[view, :2] = np.minimum(boxes[view, :2], cut.min(axis=0))
-        boxes[view, 2:] = np.maximum(boxes[view, 2:], cut.max(axis=0))
-    return boxes
+    lines = project_edges(hull, world_to_camera, intrinsics)
+    pixels = lines.reshape(len(lines), -1, 2)
+    boxes = [np.fmin.reduce(pixels, axis=1), np.fmax.reduce(pixels, axis=1)]  # these skip NaN
+    return np.concatenate(boxes, axis=1)
 
 
 def box_iou_2d(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -216,13 +219,9 @@ Agreement = dict[str, Tally]
 
 def added(agreements: Iterable[Agreement]) -> Agreement:
     """Sum of agreements."""
-    total: Agreement = {}
-    for agreement in agreements:
-        for kind, tally in agreement.items():
-            before = total.get(kind, Tally(kind))
-            sums = (a + b for a, b in zip(before[1:], tally[1:], strict=True))
-            total[kind] = Tally._make((kind, *sums))
-    return {kind: total[kind] for kind in KINDS if kind in total}
+    every = [tally for agreement in agreements for tally in agreement.values()]
+    of_kind = {kind: [tally[1:] for tally in every if tally.kind == kind] for kind in KINDS}
+    return {k: Tally(k, *map(sum, zip(*rows, strict=True))) for k, rows in of_kind.items() if rows}
 
 
 def failing(agreement: Agreement, limits: Limits) -> list[Tally]:
@@ -255,47 +254,29 @@ class Comparison(NamedTuple):
         """The comparison summed over objects and views, for each kind of 3D representation."""
         tallies = {}
         for kind in KINDS:
-            of = np.array([name == kind for name in self.kinds], dtype=bool)
-            if (judged := self.judged & of).any():
+            judged = self.judged & (np.array(self.kinds, dtype=object) == kind)
+            if judged.any():
                 held, whole = self.held & judged, self.whole & judged
-                iou = float(self.iou[whole].sum())
                 counts = (int(flags.sum()) for flags in (judged, held, whole))
-                tallies[kind] = Tally._make((kind, *counts, iou))
+                tallies[kind] = Tally(kind, *counts, float(self.iou[whole].sum()))
         return tallies
-
-
-def projections(room: Room) -> np.ndarray:
-    """Project each body to a 2D box in each view: (T, n, 4) pixels, NaN behind the camera."""
-    views = room.views
-    boxes = np.full((len(views.visible), len(room.bodies), 4), np.nan)
-    for k, body in enumerate(room.bodies):
-        if body is not None:
-            boxes[:, k] = boxes_around(body.hull, views.world_to_camera, views.intrinsics)
-    return boxes
 
 
 def compare(room: Room) -> Comparison:
     """Compare the projections of objects with their masks in all views."""
-    return compare_boxes(room, projections(room))
-
-
-def compare_boxes(room: Room, boxes_px: np.ndarray) -> Comparison:
-    """Compare given projections, (..., T, n, 4), with the masks."""
     views = room.views
     masks = views.boxes * np.tile(room.size_px, 2)
+    boxes = np.full(masks.shape, np.nan)
+    judged, whole = views.visible.copy(), own_sides(views, views.image_size).all(axis=-1)
+    for k, body in enumerate(room.bodies):
+        if body is None:
+            judged[:, k] = False
+        else:
+            boxes[:, k] = boxes_around(body.hull, views.world_to_camera, views.intrinsics)
+            whole[:, k] &= body.unoccluded
     margin = MARGIN * max(views.image_size)
     # Comparisons with NaN (behind the camera) are false: undefined projections disagree.
-    begins = (boxes_px[..., :2] <= masks[..., :2] + margin).all(axis=-1)
-    held = np.logical_and(begins, (boxes_px[..., 2:] >= masks[..., 2:] - margin).all(axis=-1))
-    whole = np.asarray(own_sides(views, views.image_size).all(axis=-1))
-    for k, body in enumerate(room.bodies):
-        if body is not None and body.unoccluded is not None:
-            whole[:, k] &= body.unoccluded
-    there = np.array([body is not None for body in room.bodies], dtype=bool)
-    return Comparison(
-        tuple(body.kind if body else "" for body in room.bodies),
-        views.visible & there,
-        held,
-        whole,
-        np.nan_to_num(box_iou_2d(boxes_px, masks)),
-    )
+    begins = (boxes[..., :2] <= masks[..., :2] + margin).all(axis=-1)
+    held = begins & (boxes[..., 2:] >= masks[..., 2:] - margin).all(axis=-1)
+    kinds = tuple(body.kind if body else "" for body in room.bodies)
+    return Comparison(kinds, judged, held, whole, np.nan_to_num(box_iou_2d(boxes, masks)))

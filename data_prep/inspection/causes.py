@@ -1,4 +1,4 @@
-"""The table of mistakes in cameras and ids: how each is corrected, and the sentence that names it.
+"""The table of mistakes in cameras: how each is corrected, and the sentence that names it.
 
 A correction is tried on a room; the mistake is there if masks and cameras agree better afterwards,
 with each other (evidence.py) or with the 3D ground truth, if it is known (agreement.py).
@@ -6,32 +6,99 @@ with each other (evidence.py) or with the 3D ground truth, if it is known (agree
 
 from collections.abc import Callable, Iterable
 from itertools import permutations, product
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
-from data_prep.inspection import messages
-from data_prep.inspection.agreement import Room, compare, compare_boxes, projections, score
-from data_prep.inspection.camera_convention import (
-    C2W,
-    MOVED,
-    OPENCV,
-    OPENGL,
-    TURNED,
-    W2C,
-    Axes,
-    Convention,
-)
+from data_prep.inspection.agreement import Room, compare, score
+from sceneprior.core.cameras import camera_centers, pixel_rays
 
 FOCAL_STEPS = tuple(k for k in range(-8, 9) if k)
 """Powers of 2^(1/6) = 1.12 by which focal lengths are scaled: 0.4 to 2.5."""
 _OFF = (-0.3, -0.15, 0.0, 0.15, 0.3)
 """Shifts of the principal point along each side, relative to the image's size."""
 
+Axes = tuple[tuple[int, ...], ...]
+"""A camera's x, y and z axes as rows, each with its components to the right, down and forward."""
+OPENCV: Axes = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+OPENGL: Axes = ((1, 0, 0), (0, -1, 0), (0, 0, -1))
+_NAMES: dict[Axes, str] = {
+    OPENCV: "OpenCV",
+    OPENGL: "OpenGL",
+    ((1, 0, 0), (0, -1, 0), (0, 0, 1)): "Unity",
+    ((0, 0, 1), (1, 0, 0), (0, -1, 0)): "Unreal",
+    ((0, 0, 1), (-1, 0, 0), (0, -1, 0)): "ROS",
+}
+_EVERY_AXES: list[Axes] = sorted(
+    (
+        tuple(map(tuple, (np.eye(3, dtype=int)[list(order)] * np.array(signs)[:, None]).tolist()))
+        for order in permutations(range(3))
+        for signs in product((1, -1), repeat=3)
+    ),
+    key=lambda axes: -round(np.linalg.det(np.array(axes))),
+)
+"""The 48 assignments of a camera's axes, left-handed ones last."""
+_DIRECTIONS = (("right", "left"), ("down", "up"), ("forward", "backward"))
+_TIMES = ("first", "second", "third")
+
+C2W, W2C, TURNED, MOVED = "c2w", "w2c", "turned", "moved"
+"""Possible contents of a matrix: camera to world; world to camera; the camera's position with the
+rotation from world to camera; the translation to the camera with the rotation from camera to
+world."""
+_CONTENTS = {
+    C2W: "camera-to-world transforms",
+    W2C: "world-to-camera transforms",
+    TURNED: "rotations from world to camera beside the cameras' positions",
+    MOVED: "rotations from camera to world beside translations from world to camera",
+}
+_TO_C2W = {
+    W2C: "invert each matrix",
+    TURNED: "transpose the upper left 3 x 3 of each matrix",
+    MOVED: "replace the last column t of each matrix by -R t",
+}
+
+
+class Convention(NamedTuple):
+    """Convention of the matrices that a room's cameras were read from, and the file's name."""
+
+    file: str = "the shards (`world_to_camera`)"
+    """Name for messages: transforms.json."""
+    reading: str = W2C
+    axes: Axes = OPENCV
+    room_from_world: np.ndarray = np.eye(4)
+    """(4, 4) rigid, from the world of the matrices (in metres) to the room."""
+    posed: bool = False
+    """True for rooms of prep-posed, whose options the messages may name."""
+
+    @classmethod
+    def stated(
+        cls, source: object, file: str | None = None, room_from_world: Any = None
+    ) -> "Convention":
+        """Convention of a data set, and of the file of poses that the report states for a room
+        (`PreparedRoom.cameras`)."""
+        usual = _OF_SOURCE.get(source, cls())
+        if file is None:
+            return usual
+        world = np.array(room_from_world, dtype=np.float64).reshape(4, 4)
+        if Path(file).name in ("cameras.bin", "cameras.txt"):
+            name = f"COLMAP's {Path(file).parent.as_posix()}"
+            return usual._replace(file=name, reading=W2C, axes=OPENCV, room_from_world=world)
+        return usual._replace(file=Path(file).name, room_from_world=world)
+
+    def with_keys(self, keys: str) -> str:
+        """Name of the file, with its keys if it is a JSON."""
+        return f"{self.file} ({keys})" if self.file.endswith(".json") else self.file
+
+
+_OF_SOURCE: dict[object, Convention] = {
+    "posed": Convention("the file of poses", C2W, OPENGL, posed=True),
+    "scannet": Convention("the scans' .sens files", C2W, OPENCV),
+}
+
 
 class Cause(NamedTuple):
-    """A mistake: the name of its row of `TABLE`, and which one of the row's mistakes it is."""
+    """A mistake: a key of `SENTENCES`, and which one of the mistakes of this name it is."""
 
     name: str
     detail: Any = None
@@ -41,37 +108,24 @@ GIVEN, CHANCE = Cause("given"), Cause("chance")
 """No mistake; and cameras of other frames, dealt out at random."""
 
 Corrected = Iterable[tuple[Cause, Room]]
-
-
-class Row(NamedTuple):
-    """A row of the table."""
-
-    correct: Callable[[Room, Convention], Corrected]
-    """The room after the correction of each mistake of the row."""
-    say: Callable[[Any, Convention], str]
-    """Sentence on a mistake, given its detail; without a full stop."""
-    corrected: str = "corrected"
-    """Name of the correction, with {} for the detail."""
-    with_truth: bool = True
-    """True if the correction is also scored with the 3D ground truth."""
+"""Causes, each with the room after its correction."""
 
 
 def corrections(room: Room, convention: Convention) -> dict[Cause, Room]:
     """The room after the correction of each cause, likelier causes first; `GIVEN` corrects nothing.
 
-    Rows that need 3D objects are left out for a room without. The other causes depend only on the
-    convention, so that sums over rooms are possible.
+    The unit needs 3D objects. The other causes depend only on the convention, so that sums over
+    rooms are possible.
     """
     views = room.views
     exact = room.seen_by(views.world_to_camera.astype(float), views.intrinsics.astype(float))
-    return {
-        cause: other for row in TABLE.values() for cause, other in row.correct(exact, convention)
-    }
+    tried = (correct(exact, convention) for correct in (_poses, _orders, _lenses, _scaled))
+    return {GIVEN: exact} | {cause: other for row in tried for cause, other in row}
 
 
 def sentence_of(cause: Cause, convention: Convention) -> str:
     """Sentence on a mistake, without a full stop."""
-    return TABLE[cause.name].say(cause.detail, convention)
+    return SENTENCES[cause.name](cause.detail, convention)
 
 
 def _poses(room: Room, convention: Convention) -> Corrected:
@@ -81,15 +135,12 @@ def _poses(room: Room, convention: Convention) -> Corrected:
     written = of_world @ np.linalg.inv(_square(convention.axes))
     if convention.reading == W2C:
         written = np.linalg.inv(written)
-    rotation, translation = written[:, :3, :3], written[:, :3, 3:]
-    contents = {
-        C2W: written,
-        W2C: np.linalg.inv(written),
-        TURNED: _matrix(rotation.swapaxes(1, 2), translation),
-        MOVED: _matrix(rotation, -rotation @ translation),
-    }
+    turned, moved = written.copy(), written.copy()
+    turned[:, :3, :3] = written[:, :3, :3].swapaxes(1, 2)
+    moved[:, :3, 3:] = -written[:, :3, :3] @ written[:, :3, 3:]
+    contents = {C2W: written, W2C: np.linalg.inv(written), TURNED: turned, MOVED: moved}
     usual = [(reading, axes) for reading in contents for axes in (OPENGL, OPENCV)]
-    rare = [(convention.reading, axes) for axes in _all_axes() if axes not in (OPENGL, OPENCV)]
+    rare = [(convention.reading, axes) for axes in _EVERY_AXES if axes not in (OPENGL, OPENCV)]
     for reading, axes in usual + rare:
         if (reading, axes) != (convention.reading, convention.axes):
             camera_to_world = contents[reading] @ _square(axes)
@@ -99,33 +150,58 @@ def _poses(room: Room, convention: Convention) -> Corrected:
             yield Cause("poses", (reading, axes)), room.seen_by(in_room)
 
 
-def _all_axes() -> list[Axes]:
-    """The 48 assignments of a camera's axes, left-handed ones last."""
-    signed = [
-        tuple(
-            tuple(sign * (k == place) for k in range(3))
-            for place, sign in zip(order, signs, strict=True)
-        )
-        for order in permutations(range(3))
-        for signs in product((1, -1), repeat=3)
-    ]
-    return sorted(signed, key=lambda axes: -round(np.linalg.det(np.array(axes))))
-
-
 def _square(axes: Axes) -> np.ndarray:
     matrix = np.eye(4)
     matrix[:3, :3] = axes
     return matrix
 
 
-def _matrix(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    matrix = np.tile(np.eye(4), (len(rotation), 1, 1))
-    matrix[:, :3, :3], matrix[:, :3, 3:] = rotation, translation
-    return matrix
+def _wrong_poses(held: tuple[str, Axes], convention: Convention) -> str:
+    """The matrices hold another reading or other axes, `held`, than the convention's."""
+    (reading, axes), expected, expected_axes = held, convention.reading, convention.axes
+    has, wants = _in_words(axes), _in_words(expected_axes)
+    left = np.linalg.det(np.array(axes)) < 0
+    if expected == W2C:
+        change = f"write {_CONTENTS[W2C]} with {_NAMES[expected_axes]}'s axes"
+    else:
+        steps = [_TO_C2W[reading]] if reading != C2W else []
+        if left:
+            row = int(np.abs(convention.room_from_world[2, :3]).argmax())
+            steps.append(f"negate the {_TIMES[row]} row of each matrix")
+        steps += [_columns(np.array(axes) @ np.array(expected_axes).T)] * (axes != expected_axes)
+        change = ", then ".join(steps)
+    if reading == expected:
+        system = "are of a left-handed system, with" if left else "have"
+        said = f"{system} {has} where {wants}"
+    else:
+        has, wants = (f" with {text}" * (axes != expected_axes) for text in (has, wants))
+        said = f"hold {_CONTENTS[reading]}{has} where {_CONTENTS[expected]}{wants}"
+    return f"the matrices in {convention.file} {said} are expected: {change}"
+
+
+def _in_words(axes: Axes) -> str:
+    words = []
+    for name, row in zip("xyz", axes, strict=True):
+        place = int(np.abs(row).argmax())
+        words.append(f"{name} {_DIRECTIONS[place][row[place] < 0]}")
+    known = f"{_NAMES[axes]}'s axes" if axes in _NAMES else "axes"
+    return f"{known} ({', '.join(words)})"
+
+
+def _columns(change: np.ndarray) -> str:
+    """Describe the multiplication of a matrix by a signed permutation of its columns."""
+    sources = np.abs(change).argmax(axis=0)
+    negative = change[sources, range(3)] < 0
+    if (sources == range(3)).all():
+        negated = [_TIMES[k] for k in np.flatnonzero(negative)]
+        return f"negate the {' and '.join(negated)} column of each matrix"
+    new = [f"{'minus ' * negative[k]}the {_TIMES[source]}" for k, source in enumerate(sources)]
+    return f"let the first three columns of each matrix be {', '.join(new)}"
 
 
 def _orders(room: Room, _: Convention) -> Corrected:
-    """Each frame with its own pose, for each way in which poses may be out of order."""
+    """Each frame with its own pose, for each way in which poses may be out of order; last, dealt
+    out at random, so that no frame keeps its own."""
     numbers = np.arange(len(room.views.visible))
     as_text = np.array(sorted(numbers, key=lambda k: str(k + 1)), dtype=np.int64)
     orders = {
@@ -139,65 +215,71 @@ def _orders(room: Room, _: Convention) -> Corrected:
     }
     for name, order in orders.items():
         yield Cause("order", name), room.seen_by(room.views.world_to_camera[order])
+    order = np.random.default_rng(0).permutation(numbers)
+    yield CHANCE, room.seen_by(room.views.world_to_camera[np.roll(order, 1)[np.argsort(order)]])
 
 
-def _focal(room: Room, _: Convention) -> Corrected:
+def _wrong_order(found: str, convention: Convention) -> str:
+    """Frames have the poses of other frames."""
+    file = convention.file
+    if found.startswith("sorted"):
+        return (
+            f"pictures and poses in {file} are sorted differently, as text (1, 10, 2) and by "
+            "number (1, 2, 10): pair each pose with its picture"
+        )
+    if found == "reverse":
+        return f"the poses in {file} are in reverse order: reverse them"
+    return f"each frame in {file} has the pose of {found}: pair each pose with its picture"
+
+
+def _lenses(room: Room, _: Convention) -> Corrected:
+    """Intrinsics with other focal lengths or principal points, or of pictures of another size."""
+    given, middle = room.views.intrinsics, room.size_px / 2
+    center = given[:, :2, 2]
+
+    def other(focal: np.ndarray | float, center: np.ndarray) -> Room:
+        lenses = given.copy()
+        lenses[:, [0, 1], [0, 1]] *= focal
+        lenses[:, :2, 2] = center
+        return room.seen_by(lenses=lenses)
+
     for step in FOCAL_STEPS:
-        lenses = room.views.intrinsics.copy()
-        lenses[:, [0, 1], [0, 1]] *= (factor := 2 ** (step / 6))
-        yield Cause("focal", factor), room.seen_by(lenses=lenses)
-
-
-def _middle(room: Room, _: Convention) -> Corrected:
-    lenses = room.views.intrinsics.copy()
-    lenses[:, :2, 2] = room.size_px / 2
-    yield Cause("middle"), room.seen_by(lenses=lenses)
-
-
-def _size(room: Room, _: Convention) -> Corrected:
-    lenses, middle = room.views.intrinsics.copy(), room.size_px / 2
-    center = lenses[:, :2, 2]
-    lenses[:, :2] *= (middle / np.where(center > 0, center, middle))[..., None]
-    yield Cause("size"), room.seen_by(lenses=lenses)
-
-
-def _centers(room: Room, _: Convention) -> Corrected:
+        yield Cause("focal", 2 ** (step / 6)), other(2 ** (step / 6), center)
+    yield Cause("middle"), other(1, middle)
+    larger = middle / np.where(center > 0, center, middle)
+    yield Cause("size"), other(larger, center * larger)
     for shift in product(_OFF, _OFF):
         if any(shift):
-            lenses = room.views.intrinsics.copy()
-            lenses[:, :2, 2] += room.size_px * np.array(shift)
-            yield Cause("center", shift), room.seen_by(lenses=lenses)
+            yield Cause("center", shift), other(1, center + room.size_px * np.array(shift))
 
 
-def _dealt_out(room: Room, _: Convention) -> Corrected:
-    """Cameras in a random order in which no frame keeps its own."""
-    order = np.random.default_rng(0).permutation(len(room.views.visible))
-    dealt = np.empty_like(order)
-    dealt[order] = np.roll(order, 1)
-    yield CHANCE, room.seen_by(room.views.world_to_camera[dealt])
+def _wrong_focal(factor: float, convention: Convention) -> str:
+    """The focal lengths must be multiplied by `factor`."""
+    times, wrong = max(factor, 1 / factor), "short" if factor > 1 else "long"
+    return (
+        f"the focal lengths in {convention.with_keys('fl_x, fl_y or camera_angle_x')} are about "
+        f"{times:.2g} times too {wrong}: multiply them by {factor:.2g}, or give the size (w, h) of "
+        "the pictures they belong to"
+    )
 
 
 def _scaled(room: Room, _: Convention) -> Corrected:
     """Translations of another unit, estimated from rays through 2D boxes, which must meet their
     objects."""
-    pairs = np.argwhere(compare(room).judged) if room.bodies else np.zeros((0, 2), dtype=int)
-    if not len(pairs):
+    views, there = room.views, [k for k, body in enumerate(room.bodies) if body is not None]
+    shown = views.visible[:, there]
+    if not shown.any():
         return
-    rows, items = pairs.T
-    views = room.views
-    centers = np.array(
-        [np.zeros(3) if body is None else body.hull.middle_m for body in room.bodies]
-    )[items]
-    boxes = views.boxes[rows, items]
-    pixels = (boxes[:, :2] + boxes[:, 2:]) / 2 * room.size_px
-    pixels = np.concatenate([pixels, np.ones((len(rows), 1))], axis=1)
-    rays = np.linalg.solve(views.intrinsics[rows], pixels[..., None])[..., 0]
-    poses = views.world_to_camera[rows]
-    across = np.cross(rays, poses[:, :3, 3])
-    off = np.cross(rays, (poses[:, :3, :3] @ centers[..., None])[..., 0])
-    length = (across**2).sum(axis=1)
-    ratios = -(across * off).sum(axis=1) / np.where(length > 0, length, np.nan)
-    ratios = ratios[np.isfinite(ratios)]
+    hulls = [body.hull.points_m for body in room.bodies if body is not None]
+    targets = np.array([(points.min(axis=0) + points.max(axis=0)) / 2 for points in hulls])
+    pixels = (views.boxes[:, there, :2] + views.boxes[:, there, 2:]) / 2 * room.size_px
+    rays = pixel_rays(pixels, views.world_to_camera, views.intrinsics)[shown]
+    eyes, targets = (
+        np.broadcast_to(points, (*shown.shape, 3))[shown]
+        for points in (camera_centers(views.world_to_camera)[:, None], targets)
+    )
+    across, length = np.cross(rays, eyes), (np.cross(rays, eyes) ** 2).sum(axis=1)
+    ratios = (across * np.cross(rays, targets)).sum(axis=1)[length > 0] / length[length > 0]
     factor = float(np.median(ratios)) if len(ratios) else 0.0
     if factor <= 0:
         return
@@ -212,58 +294,25 @@ def _scaled(room: Room, _: Convention) -> Corrected:
     yield Cause("unit", factor), scaled(factor)
 
 
-def _other_ids(room: Room, _: Convention) -> Corrected:
-    """Masks matched to the objects that they fit best.
-
-    Masks that fit no object are left out, because ids may have been shifted onto walls; if fewer
-    than a quarter of all masks remain, ids explain nothing.
-    """
-    if not room.bodies:
-        return
-    boxes, visible = projections(room), room.views.visible
-    pairs = [
-        compare_boxes(room, np.broadcast_to(boxes[:, k : k + 1], boxes.shape))
-        for k in range(len(room.bodies))
-    ]
-    seen = visible.sum(axis=0)
-    held = np.stack([(pair.held & visible).sum(axis=0) for pair in pairs], axis=1)
-    iou = np.stack([(pair.iou * visible).sum(axis=0) for pair in pairs], axis=1)
-    rows, others = linear_sum_assignment(held + iou, maximize=True)
-    fits = held[rows, others] > seen / 2
-    if seen[fits].sum() >= seen.sum() / 4:
-        yield (
-            Cause("ids"),
-            room._replace(
-                bodies=[
-                    room.bodies[other] if fit else None
-                    for other, fit in zip(others, fits, strict=True)
-                ]
-            ),
-        )
-
-
-def _plainly(sentence: str) -> Callable[[Any, Convention], str]:
-    return lambda detail, convention: sentence
-
-
-TABLE: dict[str, Row] = {
-    "given": Row(lambda room, _: [(GIVEN, room)], _plainly(""), with_truth=False),
-    "poses": Row(_poses, messages.wrong_matrices),
-    "order": Row(_orders, messages.wrong_order),
-    "focal": Row(_focal, messages.wrong_focal),
-    "middle": Row(_middle, messages.wrong_center),
-    "size": Row(_size, messages.wrong_size),
-    "center": Row(_centers, messages.wrong_center, with_truth=False),
-    "chance": Row(_dealt_out, _plainly(""), with_truth=False),
-    "unit": Row(
-        _scaled,
-        _plainly("the translations of the cameras seem to have another unit than the objects"),
-        "times {:.2g}",
+SENTENCES: dict[str, Callable[[Any, Convention], str]] = {
+    "poses": _wrong_poses,
+    "order": _wrong_order,
+    "focal": _wrong_focal,
+    "middle": lambda _, convention: (
+        f"the principal point in {convention.with_keys('cx, cy')} does not fit, the middle of the "
+        "picture does: leave it out, or give it in pixels of a w x h picture"
     ),
-    "ids": Row(
-        _other_ids,
-        _plainly("the instance ids of the masks seem to be those of other objects"),
-        "with ids exchanged",
+    "size": lambda _, convention: (
+        f"the intrinsics in {convention.file} belong to pictures of another size: give the size "
+        "(w, h) that they were measured at"
+    ),
+    "center": lambda shift, convention: (
+        f"the principal point in {convention.with_keys('cx, cy')} is off: about {shift[0]:+.0%} of "
+        f"the width and {shift[1]:+.0%} of the height must be added; were the pictures cropped "
+        "after calibration?"
+    ),
+    "unit": lambda factor, convention: (
+        "the translations of the cameras seem to have another unit than the objects"
     ),
 }
-"""Rows by name; the last two need 3D objects."""
+"""Sentences on mistakes by their names, given the detail of the cause; without full stops."""

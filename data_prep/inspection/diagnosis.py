@@ -18,18 +18,16 @@ from data_prep.inspection.agreement import (
     compare,
     score,
 )
-from data_prep.inspection.camera_convention import Convention
 from data_prep.inspection.causes import (
     CHANCE,
     FOCAL_STEPS,
     GIVEN,
-    TABLE,
     Cause,
+    Convention,
     corrections,
     sentence_of,
 )
 from data_prep.inspection.evidence import Evidence, fit, middles
-from data_prep.inspection.messages import UNITS_M, wrong_ids, wrong_unit, wrong_up
 from data_prep.tracks.associate import UNKNOWN, FrameMasks, associate
 from sceneprior.core.classes import VOID
 from sceneprior.core.observations import RoomViews, observe
@@ -52,6 +50,7 @@ _EYES_M, _LENGTHS_M = (0.2, 4.0), (0.15, 6.0)
 """Plausible ranges of the median camera height and of the median length of objects."""
 _SOME_LENGTHS = 3
 """Minimum number of objects for testing lengths: a single object may be badly visible."""
+_UNITS_M = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254, "feet": 0.3048}
 _FLOOR_M = 0.15
 _ONCE, _SOME_IDS = 0.8, 8
 """Share of ids that occur in a single view above which ids are not tracked, and the minimum number
@@ -68,26 +67,68 @@ class Finding(NamedTuple):
     sentence: str
 
 
-class TrackTrial(NamedTuple):
-    """Summed agreement and number of box middles, with the given ids and with objects found."""
+def find_mistake(
+    evidence: Evidence, convention: Convention, rooms: Callable[[], Iterable[RoomViews]]
+) -> Finding | None:
+    """The likeliest mistake; `rooms` reads some with images, and only if ids may be wrong."""
+    fit, least = evidence.share(GIVEN), margin(evidence)
+    if evidence.views <= evidence.rooms:
+        return Finding(
+            "views",
+            "there is only one frame per room, which shows no depth: give at least two from "
+            "different places, better twenty",
+        )
+    if evidence.ids >= _SOME_IDS and evidence.once > _ONCE * evidence.ids and evidence.views > 2:
+        why = f"{evidence.once} of {evidence.ids} ids are in one image only"
+        return _wrong_ids(evidence, why, convention)
+    if evidence.spare >= _SPARE_AT_LEAST:
+        causes = [cause for cause in evidence.sums if cause != CHANCE]
+        cause = max(causes, key=lambda cause: round(evidence.share(cause), 2))  # first of equals
+        best = evidence.share(cause)
+        if best - fit > least and best >= _GOOD:
+            said = f"(fit of masks and poses: {fit:.2f} as given, {best:.2f} corrected)"
+            return Finding(cause, f"{sentence_of(cause, convention)} {said}")
+        if fit < _GOOD and (why := _tracked_better(rooms())):
+            return _wrong_ids(evidence, why, convention)
+        if fit < _GOOD and fit + least / 2 < _FIT_AT_LEAST:
+            return _unexplained(evidence, convention)
+    return _implausible(evidence, convention)
 
-    given: float
-    given_middles: int
-    found: float
-    found_middles: int
 
-    @property
-    def repairs(self) -> bool:
-        """True if the objects found fit the cameras, and explain more than the given ids."""
-        fits = self.found > _GOOD * self.found_middles
-        # With right poses and wrong ids, most masks join others; with wrong poses, hardly any do.
-        return fits and self.found > _GAIN * self.given and 2 * self.found > self.given_middles
+def margin(evidence: Evidence) -> float:
+    """Minimum difference in mean agreement that is significant."""
+    return _MARGIN + _MARGIN_OF_ONE / max(evidence.spare, 1) ** 0.5
 
 
-def try_tracks(rooms: Iterable[RoomViews]) -> TrackTrial:
-    """Find the objects of rooms, read with images, without ids and classes, and compare."""
-    trials = [(*_fit(views), *_fit(_retracked(views))) for views in rooms]
-    return TrackTrial(*map(sum, zip(*trials, strict=True)))
+def _wrong_ids(evidence: Evidence, why: str, convention: Convention) -> Finding:
+    posed = "pass --tracks auto, which finds the objects"
+    return Finding(
+        "ids",
+        f"the ids of the masks are not those of objects in all frames ({evidence.counts}; {why}): "
+        f"{posed if convention.posed else 'are they shuffled?'}",
+    )
+
+
+def _tracked_better(rooms: Iterable[RoomViews]) -> str:
+    """Find the objects of rooms without ids and classes. If they fit the cameras and explain more
+    than the given ids, say how well both fit; else ""."""
+    sums = np.zeros((2, 2))
+    for views in rooms:
+        for row, of_ids in enumerate((views, _retracked(views))):
+            found = middles(of_ids)
+            poses, lenses = (
+                array[None].astype(np.float64)
+                for array in (views.world_to_camera, views.intrinsics)
+            )
+            sums[row] += float(fit(found, poses, lenses)[0].sum()), len(found.item)
+    (given, of_given), (found, of_found) = sums.tolist()
+    # With right poses and wrong ids, most masks join others; with wrong poses, hardly any do.
+    if found > _GOOD * of_found and found > _GAIN * given and 2 * found > of_given:
+        return (
+            f"fit of masks and poses: {given / max(of_given, 1):.2f} with these ids, "
+            f"{found / of_found:.2f} with objects found without them"
+        )
+    return ""
 
 
 def _retracked(views: RoomViews) -> RoomViews:
@@ -106,58 +147,6 @@ def _retracked(views: RoomViews) -> RoomViews:
     images = np.where(tracks.ids < 0, objects + 1, tracks.ids).astype(np.uint32)
     seen = observe(images, [*tracks.object_class.tolist(), VOID])
     return seen.room_views(views.room_id, views.world_to_camera, views.intrinsics)
-
-
-def _fit(views: RoomViews) -> tuple[float, int]:
-    found = middles(views)
-    poses, lenses = views.world_to_camera[None], views.intrinsics[None]
-    agreement, _ = fit(found, poses.astype(np.float64), lenses.astype(np.float64))
-    return float(agreement.sum()), len(found.item)
-
-
-def margin(evidence: Evidence) -> float:
-    """Minimum difference in mean agreement that is significant."""
-    return _MARGIN + _MARGIN_OF_ONE / max(evidence.spare, 1) ** 0.5
-
-
-def camera_cause(evidence: Evidence) -> Cause | None:
-    """Cause whose correction makes masks and cameras agree clearly better, if there is one."""
-    if evidence.spare < _SPARE_AT_LEAST:
-        return None
-    causes = [cause for cause in evidence.sums if cause != CHANCE]
-    best = max(causes, key=lambda cause: round(evidence.share(cause), 2))  # the first of equals
-    gain = evidence.share(best) - evidence.share(GIVEN)
-    return best if gain > margin(evidence) and evidence.share(best) >= _GOOD else None
-
-
-def find_mistake(
-    evidence: Evidence, convention: Convention, track: Callable[[], TrackTrial]
-) -> Finding | None:
-    """The likeliest mistake; `track` is called only if the ids may be wrong."""
-    fit = evidence.share(GIVEN)
-    if evidence.views <= evidence.rooms:
-        return Finding(
-            "views",
-            "there is only one frame per room, which shows no depth: give at least two from "
-            "different places, better twenty",
-        )
-    if evidence.ids >= _SOME_IDS and evidence.once > _ONCE * evidence.ids and evidence.views > 2:
-        why = f"{evidence.once} of {evidence.ids} ids are in one image only"
-        return Finding("ids", wrong_ids(evidence.counts, why, convention))
-    if (cause := camera_cause(evidence)) is not None:
-        said = f"{fit:.2f} as given, {evidence.share(cause):.2f} corrected"
-        sentence = f"{sentence_of(cause, convention)} (fit of masks and poses: {said})"
-        return Finding(cause, sentence)
-    doubted = evidence.spare >= _SPARE_AT_LEAST and fit < _GOOD
-    if doubted and (trial := track()).repairs:
-        why = (
-            f"fit of masks and poses: {trial.given / max(trial.given_middles, 1):.2f} with these "
-            f"ids, {trial.found / trial.found_middles:.2f} with objects found without them"
-        )
-        return Finding("ids", wrong_ids(evidence.counts, why, convention))
-    if doubted and fit + margin(evidence) / 2 < _FIT_AT_LEAST:
-        return _unexplained(evidence, convention)
-    return _implausible(evidence, convention)
 
 
 def _unexplained(evidence: Evidence, convention: Convention) -> Finding:
@@ -183,15 +172,31 @@ def _implausible(evidence: Evidence, convention: Convention) -> Finding | None:
     """Find an unusual direction, height or length, which masks alone do not determine."""
     axis = int(np.abs(evidence.tops).argmax())
     if abs(evidence.tops[axis]) > 0.5 and evidence.tops[1] <= 0.5:
-        return Finding("up", wrong_up(axis, float(np.sign(evidence.tops[axis])), convention))
+        along = np.sign(evidence.tops[axis]) * convention.room_from_world[axis, :3]
+        place = int(np.abs(along).argmax())
+        name = "xyz"[place] if along[place] > 0.9 else ""
+        cure = f"pass --up {name}" if convention.posed and name in ("y", "z") else "turn the poses"
+        where = f"along the {name} axis" if name else "in another direction"
+        return Finding(
+            "up",
+            f"the tops of the pictures point {where} of {convention.file}, which is not the axis "
+            f"that was taken as up: {cure}",
+        )
     length_m = evidence.length_m if evidence.measured >= _SOME_LENGTHS else None
-    for what, value, bounds in (
-        ("the cameras stand {} above the floor", evidence.eye_m, _EYES_M),
-        ("the objects are {} long", length_m, _LENGTHS_M),
+    for what, value, (low, high) in (
+        ("the cameras stand {:.3g} m above the floor", evidence.eye_m, _EYES_M),
+        ("the objects are {:.3g} m long", length_m, _LENGTHS_M),
     ):
-        if value is not None and not bounds[0] <= value <= bounds[1]:
-            factor = _metres_per_unit(evidence) if convention.posed else None
-            return Finding(("unit", factor), wrong_unit(what, value, bounds, factor))
+        if value is not None and not low <= value <= high:
+            unit = _likely_unit(evidence) if convention.posed else None
+            cure = "are the poses in metres, and is the floor at the right height?"
+            if unit is not None:
+                cure = (
+                    f"the poses seem to be in {unit}: pass --metres-per-unit {_UNITS_M[unit]:g} "
+                    "(or write metres_per_unit)"
+                )
+            size = f"{what.format(value)} in the median, expected {low:g} to {high:g} m"
+            return Finding(("unit", unit), f"{size}: {cure}")
     if evidence.floor_m is not None and abs(evidence.floor_m) > _FLOOR_M:
         side = "above" if evidence.floor_m > 0 else "below"
         cure = "is the floor at y = 0?"
@@ -202,40 +207,37 @@ def _implausible(evidence: Evidence, convention: Convention) -> Finding | None:
     return None
 
 
-def _metres_per_unit(evidence: Evidence) -> float | None:
-    """Metres per unit at which furniture is about 0.9 m long; None if no unit is plausible."""
+def _likely_unit(evidence: Evidence) -> str | None:
+    """Unit of the poses in which furniture is about 0.9 m long; None if no unit is plausible."""
     if evidence.length_m is None:
         return None
-    lengths = {factor: evidence.length_m * factor for factor in UNITS_M.values()}
-    best = min(lengths, key=lambda factor: abs(np.log(lengths[factor] / 0.9)))
+    lengths = {name: evidence.length_m * factor for name, factor in _UNITS_M.items()}
+    best = min(lengths, key=lambda name: abs(np.log(lengths[name] / 0.9)))
     return best if 0.4 < lengths[best] < 2 else None
 
 
 def what_was_checked(evidence: Evidence) -> tuple[list[str], list[str]]:
     """Parts of sentences on the camera errors that masks exclude, and on those they do not."""
-    fit, least = evidence.share(GIVEN), margin(evidence)
+    below = evidence.share(GIVEN) - margin(evidence)
 
-    def excluded(causes: list[Cause]) -> bool:
+    def excluded(name: str, counts: Callable[[Cause], bool] = lambda cause: True) -> bool:
+        causes = [cause for cause in evidence.sums if cause.name == name and counts(cause)]
         enough = evidence.spare >= _SPARE_AT_LEAST
-        return enough and all(fit - evidence.share(cause) > least for cause in causes)
+        return enough and all(evidence.share(cause) < below for cause in causes)
 
-    of: dict[str, list[Cause]] = {name: [] for name in TABLE}
-    for cause in evidence.sums:
-        if cause.name != "order" or "sorted" not in cause.detail:  # equal for few frames
-            of[cause.name].append(cause)
-    yes: list[str] = []
-    no: list[str] = []
-    for name, causes in (
-        ("matrices of another kind or with other axes", of["poses"]),
-        ("poses of other frames", [*of["order"], *of["chance"]]),
-        (
-            "a principal point off by 30% of the picture",
-            [cause for cause in of["center"] if max(map(abs, cause.detail)) > 0.2],
+    kinds = {
+        "matrices of another kind or with other axes": excluded("poses"),
+        # Frames sorted as text and by number are in the same order if there are few.
+        "poses of other frames": excluded("chance")
+        and excluded("order", lambda cause: "sorted" not in cause.detail),
+        "a principal point off by 30% of the picture": excluded(
+            "center", lambda cause: max(map(abs, cause.detail)) > 0.2
         ),
-    ):
-        (yes if excluded(causes) else no).append(name)
+    }
+    yes, no = ([name for name in kinds if kinds[name] is found] for found in (True, False))
     for step in sorted({abs(step) for step in FOCAL_STEPS}):
-        if excluded([c for c in of["focal"] if abs(np.log2(c.detail)) > (step - 0.5) / 6]):
+        least = (step - 0.5) / 6
+        if excluded("focal", lambda cause, least=least: abs(np.log2(cause.detail)) > least):
             yes.append(f"focal lengths {2 ** (step / 6):.2g} times as long or as short")
             break
     else:
@@ -257,45 +259,46 @@ def disagreement(tally: Tally, rooms: Iterable[tuple[Room, Convention]], limits:
             f", and those of unoccluded objects overlap with a mean 2D IoU of {tally.mean_iou:.2f}"
             f", expected at least {limits.share * IOU_AT_LEAST[tally.kind]:.2f}"
         )
-    sums: dict[str, Agreement] = {}
-    names: dict[str, str] = {}
+    sums: dict[str, tuple[str, Agreement]] = {}
     for room, convention in rooms:
         for cause, other in corrections(room, convention).items():
-            if TABLE[cause.name].with_truth:
+            if cause.name not in ("given", "center", "chance"):
                 sentence = sentence_of(cause, convention)
-                sums[sentence] = added([sums.get(sentence, {}), compare(other).agreement])
+                how = f"times {cause.detail:.2g}" if cause.name == "unit" else "corrected"
                 # Factors of different rooms differ by less than is printed: the first is kept.
-                names.setdefault(sentence, TABLE[cause.name].corrected.format(cause.detail))
+                how, before = sums.get(sentence, (how, {}))
+                sums[sentence] = how, added([before, compare(other).agreement])
     empty = Tally(tally.kind)
-    good = {
-        sentence: found for sentence, found in sums.items()
+    good = [
+        (sentence, how, found) for sentence, (how, found) in sums.items()
         if found.get(tally.kind, empty).passes(limits)
-    }  # fmt: skip
+    ]  # fmt: skip
     if not good:
         return f"{text}: is an axis or a unit wrong?"
-    best = max(good, key=lambda sentence: round(score(good[sentence]), 2))  # the first of equals
-    after = good[best].get(tally.kind, empty)
-    text += f": {best}; {names[best]}, {after.share:.0%} would"
+    best, how, found = max(good, key=lambda each: round(score(each[2]), 2))  # the first of equals
+    after = found.get(tally.kind, empty)
+    text += f": {best}; {how}, {after.share:.0%} would"
     return text + (f", with a mean 2D IoU of {after.mean_iou:.2f}" if after.whole else "")
 
 
 def outliers(seen: Comparison) -> Iterator[str]:
     """Report views and objects that disagree in a room that agrees as a whole."""
-    count, held = seen.judged.sum(axis=1), (seen.judged & seen.held).sum(axis=1)
-    wrong = np.flatnonzero((count >= 2) & (held < _OUTLIER * count))
+    held = seen.judged & seen.held
+    count, within = seen.judged.sum(axis=1), held.sum(axis=1)
+    wrong = np.flatnonzero((count >= 2) & (within < _OUTLIER * count))
     if len(wrong):
         shown = ", ".join(str(view) for view in wrong[:6])
         more = f" and {len(wrong) - 6} more" if len(wrong) > 6 else ""
         yield (
-            f"{held[wrong].sum()} of the {count[wrong].sum()} masks of views {shown}{more} lie "
+            f"{within[wrong].sum()} of the {count[wrong].sum()} masks of views {shown}{more} lie "
             "within their projections, in other views nearly all do: are their poses wrong, or "
             "those of other frames?"
         )
         return
-    seen_in = seen.judged.sum(axis=0)
-    lost = (seen.judged & ~seen.held).sum(axis=0)
-    for k in np.flatnonzero((seen_in >= 3) & (lost > _OUTLIER * seen_in)):
+    count = seen.judged.sum(axis=0)
+    lost = count - held.sum(axis=0)
+    for k in np.flatnonzero((count >= 3) & (lost > _OUTLIER * count)):
         yield (
-            f"object {k} is not where its ground truth has it: {lost[k]} of its {seen_in[k]} "
+            f"object {k} is not where its ground truth has it: {lost[k]} of its {count[k]} "
             "masks reach beyond its projection, unlike those of other objects"
         )

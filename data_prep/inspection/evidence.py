@@ -11,8 +11,7 @@ import numpy as np
 from scipy.stats import rankdata
 
 from data_prep.inspection.agreement import NEAR_M, Room
-from data_prep.inspection.camera_convention import Convention
-from data_prep.inspection.causes import Cause, corrections
+from data_prep.inspection.causes import Cause, Convention, corrections
 from data_prep.readers.upright import find_floor, own_sides
 from sceneprior.core.cameras import camera_centers
 from sceneprior.core.observations import RoomViews
@@ -46,8 +45,6 @@ class Evidence(NamedTuple):
     masks: int
     once: int
     """Number of ids that occur in one view only."""
-    measured: int
-    """Number of objects whose lengths are known."""
     nearness: float | None
     """Negated rank correlation, over pairs of views, between the pixels on common objects and the
     angle between the cameras; about 0 if poses belong to other frames. None for few views."""
@@ -59,6 +56,11 @@ class Evidence(NamedTuple):
     """Median length of the objects; None without any."""
     floor_m: float | None
     """Height of the bottoms of the lowest objects (`find_floor`); None if few of them agree."""
+
+    @property
+    def measured(self) -> int:
+        """Number of objects whose lengths are known; each takes three middles."""
+        return (self.middles - self.spare) // 3
 
     def share(self, cause: Cause) -> float:
         """Mean agreement in [0, 1] after a correction."""
@@ -73,7 +75,7 @@ class Evidence(NamedTuple):
         )
 
 
-def room_evidence(views: RoomViews, convention: Convention, floor: bool = True) -> Evidence:
+def room_evidence(views: RoomViews, convention: Convention, floor: bool) -> Evidence:
     """Compare the masks of one room, read with images, with its cameras as they are and corrected.
 
     `floor` also estimates the height of the floor, which takes longer than everything else.
@@ -82,12 +84,14 @@ def room_evidence(views: RoomViews, convention: Convention, floor: bool = True) 
     poses = np.stack([room.views.world_to_camera for room in rooms.values()])
     lenses = np.stack([room.views.intrinsics for room in rooms.values()])
     agreement, depth = fit(found, poses, lenses)
-    sums = dict(zip(rooms, agreement.sum(axis=1).tolist(), strict=True))
+    sizes_m = found.extent_px * depth[0] / lenses[0][found.view, found.axis, found.axis]
+    lengths = [sizes_m[found.item == k].max() for k in np.unique(found.item)]
+    lengths = [length for length in lengths if length > 0]
     level = find_floor(views, poses[0], lenses[0]) if floor else None
     shown = views.visible.sum(axis=0)
     x, y, z = (-poses[0, :, 1, :3]).mean(axis=0).tolist()
     return Evidence(
-        sums,
+        dict(zip(rooms, agreement.sum(axis=1).tolist(), strict=True)),
         rooms=1,
         middles=len(found.item),
         spare=found.spare,
@@ -95,44 +99,39 @@ def room_evidence(views: RoomViews, convention: Convention, floor: bool = True) 
         ids=int((shown > 0).sum()),
         masks=int(shown.sum()),
         once=int((shown == 1).sum()),
-        measured=len(np.unique(found.item)),
         nearness=_nearness(views),
         tops=(x, y, z),
         eye_m=float(np.median(camera_centers(poses[0])[:, 1])),
-        length_m=_length(found, depth[0], lenses[0]),
+        length_m=float(np.median(lengths)) if lengths else None,
         floor_m=None if level is None or level[1] < _PIECES else level[0],
     )
 
 
 def total(rooms: list[Evidence]) -> Evidence:
-    """Combine the evidence of several rooms: sums of counts, medians or means of other values."""
+    """Combine the evidence of several rooms: sums of counts, medians or means of other values.
+
+    The height of the floor is None if few rooms know it, or if they differ.
+    """
+
+    def known(name: str) -> list[float]:
+        return [value for room in rooms if (value := getattr(room, name)) is not None]
+
     causes = {cause: None for room in rooms for cause in room.sums}
-    sums = {cause: sum(room.sums.get(cause, 0.0) for room in rooms) for cause in causes}
-    names = ("rooms", "middles", "spare", "views", "ids", "masks", "once", "measured")
-    counts = {name: sum(getattr(room, name) for room in rooms) for name in names}
+    counts = ("rooms", "middles", "spare", "views", "ids", "masks", "once")
     x, y, z = np.mean([room.tops for room in rooms], axis=0).tolist()
-    nearness, length, floor = (
-        [value for room in rooms if (value := getattr(room, name)) is not None]
-        for name in ("nearness", "length_m", "floor_m")
-    )
+    nearness, lengths, floors = known("nearness"), known("length_m"), known("floor_m")
+    level = float(np.median(floors)) if floors else None
+    same = sum(abs(floor - level) < _SAME_FLOOR_M for floor in floors)
+    agreed = same >= min(len(rooms), 2) and 3 * same >= 2 * len(floors)
     return Evidence(
-        sums,
-        **counts,
+        {cause: sum(room.sums.get(cause, 0.0) for room in rooms) for cause in causes},
+        **{name: sum(getattr(room, name) for room in rooms) for name in counts},
         nearness=float(np.mean(nearness)) if nearness else None,
         tops=(x, y, z),
-        eye_m=float(np.median([room.eye_m for room in rooms])),
-        length_m=float(np.median(length)) if length else None,
-        floor_m=_usual(floor, len(rooms)),
+        eye_m=float(np.median(known("eye_m"))),
+        length_m=float(np.median(lengths)) if lengths else None,
+        floor_m=level if agreed else None,
     )
-
-
-def _usual(floors: list[float], rooms: int) -> float | None:
-    """Median height of the estimated floors; None if there are few, or if they differ."""
-    if not floors:
-        return None
-    middle = float(np.median(floors))
-    same = sum(abs(floor - middle) < _SAME_FLOOR_M for floor in floors)
-    return middle if same >= min(rooms, 2) and 3 * same >= 2 * len(floors) else None
 
 
 def _nearness(views: RoomViews) -> float | None:
@@ -191,13 +190,6 @@ def middles(views: RoomViews) -> Middles:
     return Middles(view, number, axis, (low + high) / 2, high - low, slack)
 
 
-def _length(found: Middles, depth: np.ndarray, lenses: np.ndarray) -> float | None:
-    sizes_m = found.extent_px * depth / lenses[found.view, found.axis, found.axis]
-    lengths = [sizes_m[found.item == k].max() for k in np.unique(found.item)]
-    lengths = [length for length in lengths if length > 0]
-    return float(np.median(lengths)) if lengths else None
-
-
 def fit(
     found: Middles, world_to_camera: np.ndarray, intrinsics: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -221,7 +213,14 @@ def fit(
         return none, none
     rows = np.arange(len(found.item))
     starts = np.flatnonzero(np.diff(found.item, prepend=-1))
-    scaled, unit = _unit_of_length(world_to_camera)
+    # Poses are moved and scaled: cameras then stand about 2 m from the origin, their middle.
+    eyes = camera_centers(world_to_camera)
+    middle = eyes.mean(axis=1, keepdims=True)
+    unit = np.sqrt(((eyes - middle) ** 2).sum(axis=-1).mean(axis=1)) / 2
+    unit = np.maximum(unit, 1e-9)
+    scaled = world_to_camera.copy()
+    scaled[..., :3, 3] += (world_to_camera[..., :3, :3] @ middle[..., None])[..., 0]
+    scaled[..., :3, 3] /= unit[:, None, None]
     poses = scaled[:, found.view, :3]
     focal = intrinsics[:, found.view, found.axis, found.axis]
     center = intrinsics[:, found.view, found.axis, 2]
@@ -247,16 +246,3 @@ def fit(
     off = off / np.maximum(1 - leverage, 1e-3)
     agreement = np.where(depth > NEAR_M, 1 / (1 + (off / found.slack_px) ** 2), 0.0)
     return agreement, depth * unit[:, None]
-
-
-def _unit_of_length(world_to_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Poses moved and scaled so that cameras stand about 2 m from the origin, their middle; and the
-    unit of length, (h,)."""
-    eyes = camera_centers(world_to_camera)
-    middle = eyes.mean(axis=1, keepdims=True)
-    unit = np.sqrt(((eyes - middle) ** 2).sum(axis=-1).mean(axis=1)) / 2
-    unit = np.maximum(unit, 1e-9)
-    scaled = world_to_camera.copy()
-    scaled[..., :3, 3] += (world_to_camera[..., :3, :3] @ middle[..., None])[..., 0]
-    scaled[..., :3, 3] /= unit[:, None, None]
-    return scaled, unit

@@ -12,13 +12,12 @@ from data_prep.engine.source import SPLITS
 from data_prep.inspection.agreement import KINDS
 from data_prep.inspection.causes import CHANCE, GIVEN
 from data_prep.inspection.diagnosis import what_was_checked
-from data_prep.inspection.sheet import choose_views
+from data_prep.inspection.pictures import choose_views
 from data_prep.inspection.verify import FolderCheck, RoomCheck, agreement_of, evidence_of
 from sceneprior.core.classes import label_set
 from sceneprior.core.shards import Shard, iterate_rooms, read_index
 
 _WORST_SHOWN = 5
-_JUDGED = ("fit of cameras", "in 3D", "masks within", "mean 2D IoU")
 
 
 def count_tables(folder: Path) -> list[Table]:
@@ -83,48 +82,46 @@ def room_table(folder: Path, room_id: str) -> Table:
 
 
 def check_tables(found: FolderCheck) -> list[Table]:
-    """Results of a check: each split, and the rooms that agree least."""
+    """Results of a check: each split, and the rooms that agree least.
+
+    Cells are the agreement of masks and cameras, the type of 3D representation, the share of masks
+    within their projections, and the mean IoU of fully visible objects.
+    """
+
+    def fit_of(checks: Sequence[RoomCheck]) -> list[float]:
+        evidence = evidence_of(checks)
+        return [evidence.share(GIVEN)] if evidence is not None and evidence.spare else []
+
+    def judged(checks: Sequence[RoomCheck]) -> list[str]:
+        cells = [
+            (
+                KINDS[kind],
+                f"{tally.share:.1%} of {tally.masks}",
+                f"{tally.mean_iou:.3f} of {tally.whole}" if tally.whole else "-",
+            )
+            for kind, tally in agreement_of(checks).items()
+        ]
+        fit = [f"{share:.2f}" for share in fit_of(checks)] or ["-"]
+        return fit + (["\n".join(lines) for lines in zip(*cells, strict=True)] or ["-"] * 3)
+
     totals = []
     for split, checks in found.rooms.items():
         rooms = [check for check in checks if check.room_id]
         views, sums = sum(room.views for room in rooms), sum(room.has_checksum for room in rooms)
-        totals.append((split, len(rooms), views, f"{sums} rooms", *_judged(checks)))
-    tables = [make_table(("split", "rooms", "views", "checksums", *_JUDGED), totals)]
-    if judged := [(least, check) for check in found.every if (least := _least(check)) is not None]:
-        worst = [check for _, check in sorted(judged, key=itemgetter(0))[:_WORST_SHOWN]]
+        totals.append((split, len(rooms), views, f"{sums} rooms", *judged(checks)))
+    columns = ("fit of cameras", "in 3D", "masks within", "mean 2D IoU")
+    tables = [make_table(("split", "rooms", "views", "checksums", *columns), totals)]
+    lowest = []
+    for check in found.every:
+        if shares := [*(tally.share for tally in check.agreement.values()), *fit_of([check])]:
+            lowest.append((min(shares), check))
+    if lowest:
+        worst = [check for _, check in sorted(lowest, key=itemgetter(0))[:_WORST_SHOWN]]
         # Ids are folded, because their ends, the rooms' names, must survive narrow terminals.
-        columns = (Column("worst rooms", overflow="fold"), *_JUDGED)
-        tables.append(make_table(columns, [(check.room_id, *_judged([check])) for check in worst]))
+        named = Column("worst rooms", overflow="fold")
+        rows = [(check.room_id, *judged([check])) for check in worst]
+        tables.append(make_table((named, *columns), rows))
     return tables
-
-
-def _least(check: RoomCheck) -> float | None:
-    """Lowest share or fit of a room; None if nothing determines any."""
-    fit = _fit([check])
-    shares = [tally.share for tally in check.agreement.values()]
-    return min([*shares, *([] if fit is None else [fit])], default=None)
-
-
-def _fit(checks: Sequence[RoomCheck]) -> float | None:
-    """Fit of masks and cameras; None if nothing determines it."""
-    evidence = evidence_of(checks)
-    return evidence.share(GIVEN) if evidence is not None and evidence.spare else None
-
-
-def _judged(checks: Sequence[RoomCheck]) -> list[str]:
-    """Table cells: agreement of masks and cameras, type of 3D representation, share of masks within
-    their projections, and mean IoU of fully visible objects."""
-    cells = [
-        (
-            KINDS[kind],
-            f"{tally.share:.1%} of {tally.masks}",
-            f"{tally.mean_iou:.3f} of {tally.whole}" if tally.whole else "-",
-        )
-        for kind, tally in agreement_of(checks).items()
-    ]
-    fit = _fit(checks)
-    of_truth = ["\n".join(lines) for lines in zip(*cells, strict=True)] or ["-"] * 3
-    return ["-" if fit is None else f"{fit:.2f}", *of_truth]
 
 
 def summary(found: FolderCheck) -> str:

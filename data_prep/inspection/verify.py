@@ -5,7 +5,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from data_prep.engine.source import SPLITS
+import numpy as np
+
+from data_prep.engine.plan import in_words
+from data_prep.engine.report import REPORT_NAME
+from data_prep.engine.source import SPLITS, Line
 from data_prep.engine.workers import pool
 from data_prep.inspection.agreement import (
     Agreement,
@@ -16,19 +20,13 @@ from data_prep.inspection.agreement import (
     failing,
     true_bodies,
 )
-from data_prep.inspection.camera_convention import Convention, Conventions, read_conventions
-from data_prep.inspection.checks import array_problems, mask_problems, truth_problems
-from data_prep.inspection.diagnosis import (
-    Finding,
-    TrackTrial,
-    disagreement,
-    find_mistake,
-    outliers,
-    try_tracks,
-)
+from data_prep.inspection.causes import Convention
+from data_prep.inspection.diagnosis import Finding, disagreement, find_mistake, outliers
 from data_prep.inspection.evidence import Evidence, room_evidence, total
-from sceneprior.core.classes import label_set
+from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.errors import InputError, ShardError
+from sceneprior.core.files import read_json
+from sceneprior.core.observations import RoomGroundTruth, RoomViews, observe
 from sceneprior.core.shard_writing import room_checksum
 from sceneprior.core.shards import Shard, list_shards, read_index
 
@@ -58,6 +56,8 @@ class RoomCheck:
     outliers: tuple[str, ...] = ()
     """Views and objects that disagree with the ground truth, as sentences."""
     has_checksum: bool = False
+    convention: Convention = field(default_factory=Convention, compare=False)
+    """Convention of the file that the cameras were read from."""
 
 
 @dataclass(frozen=True)
@@ -93,18 +93,17 @@ def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> Folder
     """
     folder = Path(folder)
     index = read_index(folder)
-    name = str(index.get("label_set"))
+    name, source = str(index.get("label_set")), str(index.get("source"))
     label_set(name)
-    conventions, failures = read_conventions(folder, index.get("source"))
+    usual, conventions, failures = read_conventions(folder, source)
     problems = [f"{folder}: {failures}."] if failures and room_id is None else []
     rooms: dict[str, list[RoomCheck]] = {}
     for split in SPLITS:
         if not any((folder / split).glob("*.h5")):
             continue
-        arguments = [
-            (folder, path, name, room_id, conventions) for path in list_shards(folder, split)
-        ]
+        paths = list_shards(folder, split)
         with pool(workers) as run:
+            arguments = [(folder, path, name, room_id, usual, conventions) for path in paths]
             parts = run(_check_shard, arguments, f"checking {split}")
             rooms[split] = [room for part in parts for room in part]
     found = FolderCheck(rooms, ())
@@ -117,28 +116,51 @@ def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> Folder
     for room in found.every:
         path = str(folder / room.shard)
         where = path + (f", room {room.room_id}" if room.room_id else "")
-        for sentence in room.problems:
-            # Sentences about unreadable shards already name their file.
-            text = sentence if sentence.startswith(path) else f"{where}: {sentence}"
-            problems.append(text if text.endswith("?") else f"{text}.")
+        # Sentences about unreadable shards already name their file.
+        said = [text if text.startswith(path) else f"{where}: {text}" for text in room.problems]
+        problems += [text if text.endswith("?") else f"{text}." for text in said]
     # If a room has no views, one of the problems already states the reason.
     if room_id is None and all(room.views for room in found.every):
         problems += _count_problems(folder, index, rooms)
-    problems += _mistakes(folder, found.every, conventions)
+    problems += _mistakes(folder, found.every)
     return replace(found, problems=tuple(problems))
 
 
-def _mistakes(folder: Path, rooms: Sequence[RoomCheck], conventions: Conventions) -> list[str]:
+def read_conventions(
+    folder: Path, source: str
+) -> tuple[Convention, dict[str, Convention], str | None]:
+    """The usual convention of a source, those of rooms whose file of poses the report names, by id,
+    and a sentence if more rooms failed than were prepared.
+
+    If the report is missing or from an earlier release, the usual convention is assumed.
+    """
+    usual = Convention.stated(source)
+    try:
+        lines = [Line(**line) for line in read_json(folder / REPORT_NAME)["rooms"]]
+        rooms = {
+            line.room_id: Convention.stated(source, **line.cameras)
+            for line in lines
+            if line.cameras
+        }
+    except (InputError, KeyError, TypeError, ValueError):
+        return usual, {}, None
+    failed = [line for line in lines if line.status == "failed"]
+    prepared = sum(line.status == "prepared" for line in lines)
+    said = f"{len(lines)} rooms, {prepared} prepared: {in_words(failed)}"
+    return usual, rooms, said if len(failed) > prepared else None
+
+
+def _mistakes(folder: Path, rooms: Sequence[RoomCheck]) -> list[str]:
     """A sentence on the mistake in the cameras and ids of all rooms, or sentences on the rooms that
     differ; if there are no such mistakes, sentences on the ground truth."""
 
     def mistake(checks: Sequence[RoomCheck]) -> Finding | None:
         if (evidence := evidence_of(checks)) is None:
             return None
-        origins = [conventions.of(check.room_id) for check in checks]
-        files = [origin.file for origin in origins]
-        origin = origins[files.index(max(files, key=files.count))]
-        return find_mistake(evidence, origin, lambda: _tracks_of(folder, checks))
+        files = [check.convention.file for check in checks]
+        usual = checks[files.index(max(files, key=files.count))].convention
+        most = sorted(checks, key=lambda check: -check.views)[:_TRIED_ROOMS]
+        return find_mistake(evidence, usual, lambda: (_read(folder, check).views for check in most))
 
     if (finding := mistake(rooms)) is not None:
         return [f"{folder}: {finding.sentence}."]
@@ -154,12 +176,7 @@ def _mistakes(folder: Path, rooms: Sequence[RoomCheck], conventions: Conventions
         more = f" and {len(checks) - _NAMED_ROOMS} more" * (len(checks) > _NAMED_ROOMS)
         which = "room" if len(checks) == 1 else f"{len(checks)} of {len(rooms)} rooms,"
         sentences.append(f"{folder}, {which} {named}{more}: {finding.sentence}.")
-    return sentences or _mistakes_in_3d(folder, rooms, conventions)
-
-
-def _tracks_of(folder: Path, checks: Sequence[RoomCheck]) -> TrackTrial:
-    most = sorted(checks, key=lambda check: -check.views)[:_TRIED_ROOMS]
-    return try_tracks(_read(folder, check)[0] for check in most)
+    return sentences or _mistakes_in_3d(folder, rooms)
 
 
 def _read(folder: Path, check: RoomCheck) -> Room:
@@ -170,15 +187,13 @@ def _read(folder: Path, check: RoomCheck) -> Room:
         return Room(views, true_bodies(views, shard.read_ground_truth(check.room_id), folder)[0])
 
 
-def _mistakes_in_3d(
-    folder: Path, rooms: Sequence[RoomCheck], conventions: Conventions
-) -> list[str]:
+def _mistakes_in_3d(folder: Path, rooms: Sequence[RoomCheck]) -> list[str]:
     """Sentences about ground truth and masks, in all rooms together or in single ones."""
 
     def said(checks: Sequence[RoomCheck], limits: Limits, tried: Sequence[RoomCheck]) -> list[str]:
         if not (wrong := failing(agreement_of(checks), limits)):
             return []
-        read = [(_read(folder, c), conventions.of(c.room_id)) for c in tried[:_TRIED_ROOMS]]
+        read = [(_read(folder, check), check.convention) for check in tried[:_TRIED_ROOMS]]
         return [disagreement(tally, read, limits) for tally in wrong]
 
     sentences = []
@@ -199,12 +214,8 @@ def _count_problems(
     counts = index.get("counts")
     for split, expected in counts.items() if isinstance(counts, dict) else ():
         checks = [room for room in rooms.get(split, ()) if room.room_id]
-        found = {
-            "rooms": len(checks),
-            "views": sum(room.views for room in checks),
-            "objects": sum(room.objects for room in checks),
-        }
-        for what, count in found.items():
+        views, objects = (sum(getattr(room, of) for room in checks) for of in ("views", "objects"))
+        for what, count in {"rooms": len(checks), "views": views, "objects": objects}.items():
             if expected.get(what, count) != count:
                 yield (
                     f"{folder}: index.json counts {expected[what]} {what} in '{split}', but its "
@@ -213,7 +224,12 @@ def _count_problems(
 
 
 def _check_shard(
-    folder: Path, path: Path, label_set_name: str, only: str | None, conventions: Conventions
+    folder: Path,
+    path: Path,
+    label_set_name: str,
+    only: str | None,
+    usual: Convention,
+    conventions: dict[str, Convention],
 ) -> list[RoomCheck]:
     """Check every room of a shard, or only `only`; an unreadable shard is one problem."""
     name = str(path.relative_to(folder))
@@ -225,39 +241,34 @@ def _check_shard(
                 checks.append(RoomCheck(name, "", problems=(f"{said} '{label_set_name}'",)))
             for room_id in shard.room_ids:
                 if only is None or room_id == only:
-                    convention = conventions.of(room_id)
-                    checks.append(_check_room(shard, folder, name, room_id, convention))
+                    check = RoomCheck(name, room_id, convention=conventions.get(room_id, usual))
+                    checks.append(_check_room(shard, folder, check))
     except ShardError as error:
         checks.append(RoomCheck(name, "", problems=(str(error).removesuffix("."),)))
     return checks
 
 
-def _check_room(
-    shard: Shard, folder: Path, name: str, room_id: str, convention: Convention
-) -> RoomCheck:
-    truth = None
+def _check_room(shard: Shard, folder: Path, check: RoomCheck) -> RoomCheck:
+    truth, room_id = None, check.room_id
     try:
         views = shard.read_room(room_id, images=True)
         if shard.has_ground_truth(room_id):
             truth = shard.read_ground_truth(room_id)
         stored = shard.read_checksum(room_id)
     except ShardError as error:
-        return RoomCheck(name, room_id, problems=(str(error).removesuffix("."),))
-    problems = []
-    if stored is not None and stored != room_checksum(views, truth):
-        problems.append("its checksum does not match its contents: the file was changed or damaged")
+        return replace(check, problems=(str(error).removesuffix("."),))
+    changed = "its checksum does not match its contents: the file was changed or damaged"
+    problems = [changed] * (stored is not None and stored != room_checksum(views, truth))
     wrong = [*array_problems(views, len(label_set(shard.label_set)))]
-    problems += [*wrong, *mask_problems(views)]
-    if truth is not None:
-        wrong += (found := [*truth_problems(views, truth)])
-        problems += found
-    check = RoomCheck(
-        name, room_id, len(views.visible), len(views.object_class),
-        problems=tuple(problems), has_checksum=stored is not None,
+    of_truth = [] if truth is None else [*truth_problems(views, truth)]
+    problems += [*wrong, *mask_problems(views), *of_truth]
+    check = replace(
+        check, views=len(views.visible), objects=len(views.object_class),
+        has_checksum=stored is not None, problems=tuple(problems),
     )  # fmt: skip
-    if wrong:
+    if wrong or of_truth:
         return check
-    check = replace(check, evidence=room_evidence(views, convention, truth is None))
+    check = replace(check, evidence=room_evidence(views, check.convention, truth is None))
     if truth is None:
         return check
     bodies, found = true_bodies(views, truth, folder)
@@ -266,3 +277,74 @@ def _check_room(
     return replace(
         check, problems=(*problems, *found), agreement=seen.agreement, outliers=tuple(odd)
     )
+
+
+def array_problems(views: RoomViews, classes: int) -> Iterator[str]:
+    """Report values out of range in the views; `Shard.read_room` has checked that they are
+    finite."""
+    if (views.object_class < 1).any():
+        yield f"a class index is outside 1 to {classes - 1}"
+    turn = views.world_to_camera[:, :3, :3].astype(np.float64)
+    off = np.abs(turn @ turn.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0)
+    flat = np.abs(views.world_to_camera[:, 3] - (0, 0, 0, 1)).max(axis=1, initial=0)
+    good = (off < 1e-3) & (flat < 1e-6) & (np.linalg.det(turn) > 0)
+    if not good.all():
+        yield f"the camera of view {int(np.argmin(good))} is no rotation with a translation"
+    K = views.intrinsics
+    pinhole = (K[:, (0, 1), (0, 1)] > 0).all(axis=1)
+    pinhole &= (K[:, (0, 1, 2, 2, 2), (1, 0, 0, 1, 2)] == (0, 0, 0, 0, 1)).all(axis=1)
+    if not pinhole.all():
+        yield f"the intrinsics of view {int(np.argmin(pinhole))} are not those of a pinhole camera"
+    if not ((views.boxes >= 0) & (views.boxes <= 1)).all():
+        yield "a 2D box reaches beyond the image"
+    if (views.boxes[~views.visible] != 0).any() or (views.mask_pixels[~views.visible] != 0).any():
+        yield "an object that is not visible in a view has a box or pixels there"
+    if not views.visible.any(axis=0).all():
+        yield f"no view shows object {int(np.argmin(views.visible.any(axis=0)))}"
+
+
+def mask_problems(views: RoomViews) -> list[str]:
+    """Report the first 2D box, pixel count or clear side that disagrees with its mask."""
+    assert views.instance_ids is not None
+    # All objects get a class other than void, because void masks are not measured.
+    seen = observe(views.instance_ids, [VOID + 1] * len(views.object_class) + [VOID])
+    visible, boxes, pixels, clear = (
+        np.zeros_like(getattr(views, name))
+        for name in ("visible", "boxes", "mask_pixels", "sides_clear")
+    )
+    visible[:, seen.tracked], boxes[:, seen.tracked] = seen.visible, seen.boxes
+    pixels[:, seen.tracked], clear[:, seen.tracked] = seen.mask_pixels, seen.sides_clear
+    for view, k in np.argwhere(visible != views.visible)[:1]:
+        mask = np.argwhere(views.instance_ids[view] == k + 1)
+        height, width = np.ptp(mask, axis=0) + 1 if len(mask) else (0, 0)
+        said = "visible" if views.visible[view, k] else "not visible"
+        size = f"{width} x {height} pixels"
+        return [f"view {view}, object {k} is said to be {said}, but its mask is {size}"]
+    for wrong, sentence in (
+        ((boxes != views.boxes).any(axis=2), "its 2D box does not fit its mask"),
+        (pixels != views.mask_pixels, "its mask has {} pixels, mask_pixels says {}"),
+        # Objects too narrow to be visible in any view (and, in shards of version 1, void furniture)
+        # are 0 in the image but can touch a side: fewer sides may be clear.
+        (
+            (views.sides_clear & ~clear).any(axis=2),
+            "another object touches a side of its box that is said to be clear",
+        ),
+    ):
+        for view, k in np.argwhere(wrong & visible)[:1]:
+            counts = pixels[view, k], views.mask_pixels[view, k]
+            return [f"view {view}, object {k}: {sentence.format(*counts)}"]
+    return []
+
+
+def truth_problems(views: RoomViews, truth: RoomGroundTruth) -> Iterator[str]:
+    """Report ground truth that is inconsistent in itself or with the tracked objects.
+
+    `Shard.read_ground_truth` has checked that its numbers are finite and its arrays equally long.
+    """
+    if truth.unoccluded is not None and truth.unoccluded.shape != views.visible.shape:
+        came = truth.unoccluded.shape
+        yield f"ground truth: unoccluded has shape {came}, expected {views.visible.shape}"
+    if not np.array_equal(truth.object_class[: len(views.object_class)], views.object_class):
+        yield "ground truth: its first rows are not the tracked objects"
+    if (truth.sizes_m < 0).any():
+        yield "ground truth: a size is negative"

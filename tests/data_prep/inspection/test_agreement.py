@@ -16,10 +16,8 @@ from data_prep.inspection.agreement import (
     Room,
     Tally,
     added,
-    box_iou_2d,
     boxes_around,
     compare,
-    compare_boxes,
     failing,
     hull_of,
     hull_of_model,
@@ -53,13 +51,17 @@ def test_a_right_room_agrees_to_the_pixel(made):
     tally = seen.agreement["mesh"]
     # What is hidden in part lies within its projection, too.
     assert tally.share == 1.0 and tally.masks == views.visible.sum() and tally.mean_iou > 0.95
-    height, width = views.image_size
     assert 3 < seen.whole.sum() < views.visible.sum()
-    for view, k in zip(*np.nonzero(seen.whole), strict=True):
-        rows, columns = np.nonzero(views.instance_ids[view] == k + 1)
-        assert rows.min() > 0 and rows.max() < height - 1
-        assert columns.min() > 0 and columns.max() < width - 1
-        assert views.sides_clear[view, k].all()
+    assert views.sides_clear[seen.whole].all()
+    margin = MARGIN * room.size_px[0]
+    for grow, share in ((margin - 1.5, 1.0), (margin + 1.5, 0.0)):
+        boxes = views.boxes + np.array([-1, -1, 1, 1]) * grow / np.tile(room.size_px, 2)
+        wider = compare(room._replace(views=replace(views, boxes=boxes)))
+        assert wider.held[seen.whole].mean() == share
+    behind = compare(room.seen_by(np.diag([1, -1, -1, 1.0]) @ views.world_to_camera))
+    tally = behind.agreement["mesh"]
+    assert tally.masks == views.visible.sum() and tally.share == tally.mean_iou == 0.0
+    assert failing({"mesh": tally}, Limits()) == [tally]
 
 
 def test_without_meshes_the_boxes_stand_for_them(made):
@@ -71,29 +73,14 @@ def test_without_meshes_the_boxes_stand_for_them(made):
     assert problems == [] and tally.share == 1.0 and tally.mean_iou > 0.85
 
 
-def test_what_is_undefined_disagrees_and_the_margin_is_what_it_says(made):
-    views = made[0]
-    room, _ = room_of(*made)
-    boxes = views.boxes * np.tile(room.size_px, 2)
-    margin = MARGIN * room.size_px[0]
-    for grow, share in ((0.0, 1.0), (-0.99 * margin, 1.0), (-1.01 * margin, 0.0), (50, 1.0)):
-        wider = boxes + np.array([-grow, -grow, grow, grow])
-        assert compare_boxes(room, wider).agreement["mesh"].share == share
-    behind = compare_boxes(room, np.full(boxes.shape, np.nan)).agreement["mesh"]
-    assert behind.masks == views.visible.sum() and behind.share == behind.mean_iou == 0.0
-    assert failing({"mesh": behind}, Limits()) == [behind]
-
-
 def test_models_that_are_missing_or_damaged_are_named(made, tmp_path):
     views, truth, _ = made
     shards = shutil.copytree(made[2], tmp_path / "shards")
     path = shards / "models" / f"{truth.model_ids[0]}.ply"
-    whole = path.read_bytes()
+    path.write_bytes(path.read_bytes()[:-20])
     hull_of_model.cache_clear()
-    for damaged in (whole[:-20], whole.replace(b"element face 12", b"element face 0 ")):
-        path.write_bytes(damaged)
-        with pytest.raises(ShardError, match=r"\.ply is not a triangle mesh \(\w+: "):
-            hull_of_model(path)
+    with pytest.raises(ShardError, match=r"\.ply is not a triangle mesh \(\w+: "):
+        hull_of_model(path)
     path.unlink()
     room, problems = room_of(views, truth, shards)
     assert None in room.bodies and not compare(room).judged[:, room.bodies.index(None)].any()
@@ -105,7 +92,6 @@ def test_agreements_add_up():
     meshes = Tally("mesh", 6, 6)
     total = added([{"box": first}, {"mesh": meshes, "box": second}])
     assert total == {"mesh": meshes, "box": Tally("box", 10, 9, 2, 1.5)}
-    assert total["box"].share == 0.9 and total["box"].mean_iou == 0.75
     assert failing(total, Limits()) == [] and failing({"box": first}, Limits()) == [first]
     assert failing({"box": first}, Limits(masks=5)) == []
 
@@ -116,8 +102,7 @@ def test_a_mirrored_truth_does_not_agree(made):
     moved = replace(truth, model_to_room=(mirror @ truth.model_to_room).astype(np.float32))
     room, problems = room_of(views, moved, shards)
     tally = compare(room).agreement["mesh"]
-    assert tally.masks == views.visible.sum() and tally.mean_iou < 0.6
-    assert failing({"mesh": tally}, Limits()) == [tally]
+    assert tally.mean_iou < 0.6 and failing({"mesh": tally}, Limits()) == [tally]
     assert len(problems) >= 2 and "m from the box around its placed mesh" in problems[0]
 
 
@@ -137,23 +122,13 @@ def test_a_hull_projects_as_all_of_its_points_do(numbers):
         pixels = seen[:, :2] / seen[:, 2:]
         (box,) = boxes_around(hull, camera[None], K[None])
         np.testing.assert_allclose(box, [*pixels.min(axis=0), *pixels.max(axis=0)], rtol=1e-6)
-    behind = Hull(-np.abs(points), hull_of(points).edges[:0])
+    behind = Hull(-np.abs(points), hull_of(points).edges)
     assert np.isnan(boxes_around(behind, np.eye(4)[None], K[None])).all()
 
 
-@pytest.mark.parametrize("flat", [(1, 0, 1), (1, 1, 0), (0, 0, 1), (0, 0, 0)])
+@pytest.mark.parametrize("flat", [(1, 0, 1), (0, 0, 1), (0, 0, 0)])
 def test_flat_things_have_a_hull(flat, numbers):
     points = numbers.normal(size=(30, 3)) * flat
     hull = hull_of(points)
     np.testing.assert_allclose(hull.points_m.min(axis=0), points.min(axis=0), atol=1e-9)
     np.testing.assert_allclose(hull.points_m.max(axis=0), points.max(axis=0), atol=1e-9)
-
-
-def test_overlap_of_boxes():
-    unit = np.array([0.0, 0, 1, 1])
-    for other, expected in (
-        (unit, 1.0), ([0.5, 0, 1.5, 1], 1 / 3), ([1, 0, 2, 1], 0.0), ([3, 3, 4, 4], 0.0),
-        ([0.25, 0.25, 0.75, 0.75], 0.25),
-    ):  # fmt: skip
-        assert box_iou_2d(unit, np.array(other)) == pytest.approx(expected, abs=1e-15)
-    assert np.isnan(box_iou_2d(unit, np.full(4, np.nan)))

@@ -7,7 +7,7 @@ import pytest
 from front_jobs import bedroom_shards, rooms_of
 from golden_values import hold
 
-from data_prep.inspection.checks import array_problems, mask_problems, truth_problems
+from data_prep.inspection.verify import array_problems, mask_problems, truth_problems
 
 
 @pytest.fixture(scope="module")

@@ -13,10 +13,9 @@ from captures import FLIP, Z_UP, changed, make_captures, of_ids, of_keys, of_pos
 from golden_values import hold
 from mutations import scaled
 
-from data_prep.inspection.camera_convention import read_conventions
 from data_prep.inspection.diagnosis import find_mistake
 from data_prep.inspection.tables import summary
-from data_prep.inspection.verify import evidence_of, verify
+from data_prep.inspection.verify import evidence_of, read_conventions, verify
 from sceneprior.core.errors import InputError
 
 MIRROR = np.diag([1.0, -1, 1, 1])
@@ -148,8 +147,8 @@ def test_few_pieces_tell_neither_floor_nor_unit(tmp_path, rooms, seed, views_per
 
 def test_right_captures_pass_and_a_floor_at_the_wrong_height_is_named(captures, tmp_path):
     shards = shards_of(captures, tmp_path / "shards")
-    found, (conventions, _) = verify(shards), read_conventions(shards, "posed")
+    found, (usual, *_) = verify(shards), read_conventions(shards, "posed")
     assert found.problems == ()
     high = evidence_of(found.every)._replace(floor_m=0.4)
-    said = find_mistake(high, conventions.usual, lambda: pytest.fail("no doubt")).sentence
+    said = find_mistake(high, usual, lambda: pytest.fail("no doubt")).sentence
     hold("mistakes", {"nothing": summary(found), "floor": said}, slack=0.02)

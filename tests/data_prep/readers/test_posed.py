@@ -13,7 +13,7 @@ from tiny_runs import tiny_config
 from data_prep.engine.build import Job, build_shards
 from data_prep.engine.source import RoomTask
 from data_prep.engine.workers import pool
-from data_prep.inspection.checks import array_problems, mask_problems
+from data_prep.inspection.verify import array_problems, mask_problems
 from data_prep.readers.posed.reader import Posed, find_rooms
 from data_prep.readers.posed.recording import frame_intrinsics, room_name, seems_up
 from data_prep.readers.posed.transforms import read_recording
