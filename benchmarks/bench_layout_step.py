@@ -34,8 +34,9 @@ from sceneprior.core.cameras import MIN_DEPTH_M, Boxes2D, project
 from sceneprior.core.proxies import icosphere, place
 from sceneprior.core.views import DecodedScenes, SceneViews
 from sceneprior.paper.config import PaperConfig
+from sceneprior.paper.losses import layout_losses
+from sceneprior.paper.matching import seen_boxes
 from sceneprior.paper.prior import ScenePrior
-from sceneprior.paper.view_loss import match_and_score, proxy_boxes
 from sceneprior.training.steps import weighted_sum
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
@@ -76,7 +77,7 @@ def make_views(rooms: int, views: int, objects: int) -> SceneViews:
             torch.ones(rooms, objects, dtype=torch.bool), cameras, lens, blank,
             blank[..., 0].bool(), blank.bool(), SIZE,
         )  # fmt: skip
-        seen = proxy_boxes(empty, frame, "ellipsoid")
+        seen = seen_boxes(empty, frame, "ellipsoid")
     generator = torch.Generator().manual_seed(1)
     classes = torch.randint(1, CLASSES, (rooms, objects), generator=generator)
     return replace(
@@ -96,8 +97,8 @@ def room(batch: Batch, index: int) -> Batch:
 
 def our_step(prior: ScenePrior, z: Tensor, views: SceneViews, config: PaperConfig) -> None:
     scenes = prior.decode(z, with_shape=False)
-    boxes = proxy_boxes(scenes, views, "ellipsoid")
-    losses, _ = match_and_score(scenes, boxes, views, config.loss, "first_n")
+    boxes = seen_boxes(scenes, views, "ellipsoid")
+    losses, _ = layout_losses(scenes, boxes, views, config.loss, "first_n")
     weighted_sum(losses, config.loss).backward()
 
 
@@ -132,7 +133,7 @@ def their_step(prior: ScenePrior, z: Tensor, views: SceneViews, config: PaperCon
         one, seen = room(loose, index), room(views, index)
         points = place(sphere, one.centers_m, one.sizes_m)
         boxes = their_boxes(points, seen)
-        losses, _ = match_and_score(one, boxes, seen, config.loss, "first_n")
+        losses, _ = layout_losses(one, boxes, seen, config.loss, "first_n")
         (weighted_sum(losses, config.loss) / len(z)).backward()
     torch.autograd.backward(outputs, [leaf.grad for leaf in leaves])
 

@@ -31,10 +31,9 @@ from sceneprior.core.ground_truth import known_in_3d
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.core.surfaces import chamfer_of, surface_points
 from sceneprior.evaluation.metrics.overlaps import plausible_pairs, room_overlaps
-from sceneprior.paper.decode import DecodedRoom, decode_rooms
 from sceneprior.paper.interpolate import RoomPath, even_places
 from sceneprior.paper.prior import TrainedPrior
-from sceneprior.paper.sampling import sample_latents
+from sceneprior.paper.sampling import DecodedRoom, decode_rooms, draw_latents
 
 JUMP = 3.0
 """A jump is a step of more than this multiple of the median."""
@@ -87,7 +86,7 @@ def tell(**row: Any) -> None:
 def paths_of(trained: TrainedPrior, count: int, seed: int) -> dict[str, list[RoomPath]]:
     """Paths between random training rooms, if they are known, and between random latents."""
     space, rng = trained.prior.latent_space, np.random.default_rng(seed)
-    anywhere = sample_latents(space, trained.logits, 2 * count, seed).unflatten(0, (count, 2))
+    anywhere = draw_latents(trained, 2 * count, seed, "paper").unflatten(0, (count, 2))
     ends = {"latents anywhere": anywhere}
     if len(trained.logits) > 1:
         pairs = [rng.choice(len(trained.logits), 2, replace=False) for _ in range(count)]

@@ -36,7 +36,7 @@ from sceneprior.core.scene import Scene
 from sceneprior.core.shards import iterate_rooms
 from sceneprior.evaluation.metric import Comparison, RoomSet
 from sceneprior.evaluation.metrics.relations import relation_distance
-from sceneprior.paper.decode import decode_training_rooms
+from sceneprior.paper.sampling import decode_training_rooms
 
 TRAIN_SHARE = 0.7
 """Share of made homes in the train split."""

@@ -36,14 +36,11 @@ from sceneprior.core.observations import RoomViews, thinned
 from sceneprior.core.proxies import icosphere, place
 from sceneprior.core.shards import Shard
 from sceneprior.core.views import SceneViews
-from sceneprior.paper.decode import decode_latents
 from sceneprior.paper.interpolate import interpolate
-from sceneprior.paper.latents import LatentSphere
 from sceneprior.paper.losses import soft_iou
-from sceneprior.paper.matching import match_objects, matching_cost
-from sceneprior.paper.prior import TrainedPrior
-from sceneprior.paper.sampling import latent_of
-from sceneprior.paper.view_loss import proxy_boxes
+from sceneprior.paper.matching import match_objects, matching_cost, seen_boxes
+from sceneprior.paper.prior import LatentSphere, TrainedPrior
+from sceneprior.paper.sampling import decode_latents, latent_of
 from sceneprior.render.pictures import contact_sheet, paint_ids, png_bytes
 from sceneprior.render.silhouettes import render_silhouettes
 from sceneprior.render.topdown import corner_view, perspective
@@ -184,7 +181,7 @@ def draw_matching(prior: TrainedPrior, views: SceneViews, path: Path) -> None:
     names = label_set(prior.config.label_set)
     z = prior.prior.latent_space.step(latent_of(prior, ROOM)[None], length=0.25, seed=0)
     decoded = prior.prior.decode(z)
-    boxes = proxy_boxes(decoded, views, "beveled_box")
+    boxes = seen_boxes(decoded, views, "beveled_box")
     matches = match_objects(decoded, boxes, views, LAMBDA_B)
     cost = matching_cost(decoded, boxes, views, LAMBDA_B)[0]
     labels, count = views.object_class[0].tolist(), len(views.object_class[0])

@@ -10,9 +10,8 @@ from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.config import SAMPLER, TrainedLifted
 from sceneprior.lifted.drawing.scenes import drawn_by_sampler, sample_scenes
 from sceneprior.lifted.requests.request import RoomRequest
-from sceneprior.paper.decode import decode_latents
 from sceneprior.paper.prior import TrainedPrior
-from sceneprior.paper.sampling import draw_latents, scene_names
+from sceneprior.paper.sampling import decode_latents, draw_latents, scene_names
 from sceneprior.training.method import Trained, TrainedReconstructor
 
 
@@ -62,7 +61,7 @@ def sample_rooms(
             "take a prior with a sampler."
         )
     if isinstance(trained, TrainedPrior):
-        z, _ = draw_latents(trained, count, seed, distribution)
+        z = draw_latents(trained, count, seed, distribution)
         return decode_latents(trained, z, names)
     if distribution is not None:
         raise InputError(

@@ -18,7 +18,7 @@ from sceneprior.baselines.true_boxes import BoxConfig, room_means
 from sceneprior.core.mixtures import draw_index
 from sceneprior.core.settings import Section
 from sceneprior.core.views import RoomBoxes
-from sceneprior.paper.layers import mlp
+from sceneprior.paper.decoders import mlp
 from sceneprior.training.steps import batch_seed, full_precision
 
 LEVELS = 256

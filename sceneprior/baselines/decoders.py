@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from sceneprior.baselines.atiss import EncoderConfig
-from sceneprior.paper.layers import DecoderConfig
+from sceneprior.paper.transformer import DecoderConfig
 
 
 class LstmConfig(DecoderConfig):

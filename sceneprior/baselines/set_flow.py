@@ -18,7 +18,7 @@ from sceneprior.baselines.one_stage import OneStage, OneStageTraining
 from sceneprior.baselines.true_boxes import BoxConfig, room_means
 from sceneprior.core.mixtures import draw_index
 from sceneprior.core.views import RoomBoxes
-from sceneprior.paper.layers import mlp
+from sceneprior.paper.decoders import mlp
 from sceneprior.paper.matching import assign
 from sceneprior.training.steps import full_precision
 

@@ -20,7 +20,7 @@ from sceneprior.baselines.one_stage import OneStage, OneStageTraining
 from sceneprior.baselines.true_boxes import BoxConfig, room_means
 from sceneprior.core.settings import Section
 from sceneprior.core.views import RoomBoxes
-from sceneprior.paper.layers import mlp
+from sceneprior.paper.decoders import mlp
 from sceneprior.training.steps import full_precision
 
 COMPONENTS = 64

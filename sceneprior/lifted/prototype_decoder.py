@@ -40,7 +40,7 @@ from sceneprior.lifted.shape_morphing import (
     posed_parts,
     stretched_parts,
 )
-from sceneprior.paper.layers import ShapeModule, ShapeModuleConfig
+from sceneprior.paper.decoders import ShapeModule, ShapeModuleConfig
 
 
 class PrototypeConfig(ShapeModuleConfig):

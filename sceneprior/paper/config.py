@@ -48,10 +48,6 @@ class PaperConfig(PriorConfig):
     def distribution(self) -> str:
         return self.sampling.distribution
 
-    @property
-    def view_terms(self) -> tuple[LossConfig, ShapeConfig | None]:
-        return self.loss, self.shape
-
     def stages(self) -> tuple[Stage, ...]:
         views = self.data.views_per_room
         boxes = partial(self.open_views, views, None)

@@ -1,8 +1,9 @@
 """The decoders of an object's feature (section 3.3): class, box and completeness (Eq. 5), bevels,
 and shape, a template mesh deformed by a point-wise MLP (Eq. 6)."""
 
+from abc import ABC, abstractmethod
 from dataclasses import replace
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -12,12 +13,18 @@ from torch.nn import functional as F
 
 from sceneprior.core.classes import VOID
 from sceneprior.core.proxies import icosphere, place, to_cube
-from sceneprior.core.scene import Mesh
+from sceneprior.core.scene import Mesh, Solid
+from sceneprior.core.settings import Section
 from sceneprior.core.views import DecodedScenes
-from sceneprior.paper.layers import ShapeModule, ShapeModuleConfig, mlp
 
 INITIAL_SIZE_M = 0.7
 """Edge of every box before training."""
+
+
+def mlp(*layers: nn.Module, slope: float = 0.0) -> nn.Sequential:
+    """The layers in sequence, with a ReLU between them, or a leaky ReLU if `slope` is not 0."""
+    between = nn.LeakyReLU(slope) if slope else nn.ReLU()
+    return nn.Sequential(*[part for layer in layers for part in (layer, between)][:-1])
 
 
 class Layout(NamedTuple):
@@ -178,6 +185,53 @@ class ClassBevels(nn.Module):
         return class_logits.detach().softmax(dim=-1) @ self.logits.sigmoid()
 
 
+class ShapeModule(nn.Module, ABC):
+    """A shape decoder: maps an object's feature to its shape, and the shape to a mesh."""
+
+    faces: Tensor | None
+    """(faces, 3) triangles, if all meshes of the decoder share them; else None."""
+
+    @abstractmethod
+    def add_shapes(
+        self,
+        scenes: DecodedScenes,
+        features: Float[Tensor, "rooms objects features"],
+        with_shape: bool | Bool[Tensor, "rooms shaped"],
+        wanted: Bool[Tensor, "rooms wanted"] | None,
+    ) -> DecodedScenes:
+        """The decoded layouts with shapes added; the arguments are those of `ScenePrior.decode`."""
+
+    def along_path(
+        self,
+        rooms: DecodedScenes,
+        places: Float[Tensor, " rooms"],
+        path: DecodedScenes,
+        kept: Bool[Tensor, "steps objects"],
+    ) -> DecodedScenes:
+        """Rooms at places (0 to 1) of a path, with shapes that change gradually along it.
+
+        `path` has the rooms at equal steps from 0 to 1, and `kept` selects the predictions that are
+        objects. Deformed meshes change gradually anyway, so by default `rooms` stays unchanged.
+        """
+        return rooms
+
+    @abstractmethod
+    def mesh_of(self, decoded: DecodedScenes, room: int, item: int) -> Mesh | None:
+        """The mesh of prediction `item`; None if shapes were not decoded."""
+
+    def solids_of(self, decoded: DecodedScenes, room: int, item: int) -> tuple[Solid, ...]:
+        """The convex solids of prediction `item`; none for shapes that are not made of solids."""
+        return ()
+
+
+class ShapeModuleConfig(Section, ABC):
+    """A config section that builds a shape decoder."""
+
+    @abstractmethod
+    def build(self, features: int) -> ShapeModule:
+        """The module for object features of width `features`, freshly initialised."""
+
+
 class ShapeDecoderConfig(ShapeModuleConfig):
     """Template and size of the shape decoder."""
 
@@ -204,10 +258,6 @@ class ShapeDecoder(ShapeModule):
     r is two further layers on MLP1's output, as in the released code; `features` is the size of
     that output.
     """
-
-    nothing: ClassVar[float] = 0.0
-    """Canonical coordinate of every vertex of an object that was not decoded: the centre of its
-    box."""
 
     def __init__(self, features: int, config: ShapeDecoderConfig):
         super().__init__()
@@ -262,7 +312,7 @@ class ShapeDecoder(ShapeModule):
             assert isinstance(shaped, Tensor)
             shaped = F.pad(shaped, (0, features.shape[1] - shaped.shape[1]))
             some = self(features[shaped].unsqueeze(0))[0].to(dtype)
-            shapes = some.new_full((*shaped.shape, *some.shape[1:]), self.nothing)
+            shapes = some.new_zeros(*shaped.shape, *some.shape[1:])
             shapes = shapes.index_put((shaped,), some)
         return replace(scenes, vertices_m=place(shapes, scenes.centers_m, scenes.sizes_m))
 

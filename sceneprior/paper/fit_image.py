@@ -9,10 +9,11 @@ from torch import Tensor
 
 from sceneprior.core.errors import InputError
 from sceneprior.core.views import DecodedScenes, SceneViews, rows_of
-from sceneprior.paper.losses import mask_loss
-from sceneprior.paper.matching import Matches
+from sceneprior.paper.config import PaperConfig
+from sceneprior.paper.losses import layout_losses, mask_loss, seen_masks
+from sceneprior.paper.matching import Matches, seen_boxes
 from sceneprior.paper.prior import TrainedPrior
-from sceneprior.paper.view_loss import match_and_score, seen_boxes, seen_masks
+from sceneprior.paper.settings import LossConfig, ShapeConfig
 from sceneprior.training.steps import check_finite, weighted_sum
 
 CHECK_EVERY = 20
@@ -95,15 +96,17 @@ def view_loss(
     `scenes` have at least as many objects as the fullest image shows. If `masks` is true, rendered
     masks are compared as well, which needs instance ids in `views`, and objects with meshes.
     """
-    weights, drawing = trained.config.view_terms
-    boxes = seen_boxes(scenes, views, drawing)
-    losses, matches = match_and_score(scenes, boxes, views, weights, None)
+    config = trained.config
+    weights, stage = LossConfig(), ShapeConfig(epochs=1)  # the paper's, for runs without views
+    if isinstance(config, PaperConfig):
+        weights, stage = config.loss, config.shape
+    boxes = seen_boxes(scenes, views, stage.proxy, stage.box_from)
+    losses, matches = layout_losses(scenes, boxes, views, weights, None)
     total = weighted_sum(losses, weights)
-    faces = trained.prior.faces
-    if not masks or scenes.vertices_m is None or faces is None or drawing is None:
-        return ViewLoss(total, total.detach(), torch.zeros_like(total), matches)
-    layout = total.detach()
-    seen = seen_masks(scenes.vertices_m, faces, views, drawing)
+    layout, faces = total.detach(), trained.prior.faces
+    if not masks or scenes.vertices_m is None or faces is None:
+        return ViewLoss(total, layout, torch.zeros_like(total), matches)
+    seen = seen_masks(scenes.vertices_m, faces, views, stage)
     mask, overlap = mask_loss(seen, views, matches, weights.iou_gate, per_room=True)
     score = layout + weights.mask * (1 - overlap["mask_iou"])
     return ViewLoss(total + weights.mask * mask, score, overlap["mask_iou"], matches)

@@ -12,14 +12,18 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from sceneprior.core.classes import VOID, label_set
-from sceneprior.core.errors import InputError
 from sceneprior.core.files import write_whole
 from sceneprior.core.repeatable import single_threaded
 from sceneprior.core.scene import Scene
 from sceneprior.core.views import DecodedScenes
-from sceneprior.paper.decode import DecodedRoom, decode_rooms, kept_predictions
 from sceneprior.paper.prior import TrainedPrior
-from sceneprior.paper.sampling import Point, latent_of
+from sceneprior.paper.sampling import (
+    DecodedRoom,
+    Point,
+    decode_rooms,
+    kept_predictions,
+    latent_of,
+)
 from sceneprior.render.appearance import quiet_colors
 from sceneprior.render.pictures import contact_sheet, gif_bytes, png_bytes
 from sceneprior.render.topdown import corner_view, perspective
@@ -58,14 +62,8 @@ class RoomPath:
         Raises:
             InputError: the two ends are antipodal.
         """
-        start, end = (z.expand(len(places), -1) for z in (self.start, self.end))
-        try:
-            return self.trained.prior.latent_space.between(start, end, places.to(start.dtype))
-        except ValueError:
-            raise InputError(
-                "The two ends are opposite points of the sphere, and every great circle leads from "
-                "one to the other; choose another end, or go by way of a third room."
-            ) from None
+        space = self.trained.prior.latent_space
+        return space.between(self.start, self.end, places.to(self.start.dtype))
 
     def rooms(self, places: Float[Tensor, " rooms"], names: Sequence[str]) -> list[DecodedRoom]:
         """The rooms at these places."""

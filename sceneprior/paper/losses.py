@@ -1,4 +1,4 @@
-"""The losses of rooms seen in views: layout (section 3.4, Eq. 7 and S4) and masks (Eq. 8).
+"""The view loss (section 3.4): losses of layouts (Eq. 7 and S4), and of rendered masks (Eq. 8).
 
 Completeness scores have two conventions, for a room of n objects:
 
@@ -16,7 +16,10 @@ from torch.nn import functional as F
 
 from sceneprior.core.cameras import Boxes2D, camera_centers, pixel_rays
 from sceneprior.core.views import DecodedScenes, SceneViews
-from sceneprior.paper.matching import Matches, side_distance
+from sceneprior.paper.matching import Matches, first_predictions, match_objects, side_distance
+from sceneprior.paper.settings import LossConfig, ShapeConfig
+from sceneprior.render.silhouettes.render import render_silhouettes
+from sceneprior.training.steps import check_finite, weighted_sum
 
 CERTAIN = 1e-6
 """Pixels of a mask whose value is within this distance of 0 or 1 get no gradient."""
@@ -33,36 +36,39 @@ def layout_losses(
     scenes: DecodedScenes,
     boxes_2d: Boxes2D,
     views: SceneViews,
-    matches: Matches,
-    occlusion_slack: float = 1.0,
-    completeness_target: str | None = "first_n",
-) -> dict[str, Float[Tensor, "*rooms"]]:
-    """The four terms of the layout loss (Eq. 7), unweighted.
+    weights: LossConfig,
+    completeness_target: str | None,
+) -> tuple[dict[str, Float[Tensor, "*rooms"]], Matches]:
+    """The four terms of the layout loss (Eq. 7), unweighted, and the matches that they compare.
 
         L_L = lambda_l L_l + lambda_box L_box + lambda_p L_p + lambda_f L_f
 
     Each term is averaged over the objects that it applies to, over the batches of all processes
-    (`share_of_batch`). `boxes_2d` holds the predictions' boxes in the views. `occlusion_slack` is
-    explained in `side_distance`; `completeness_target` is a convention of this module. None is for
-    rooms that are fitted: each room has its own losses, without completeness, since a single image
-    does not show how many objects the room holds (supplement D).
+    (`share_of_batch`). `boxes_2d` holds the predictions' boxes in the views; `completeness_target`
+    is a convention of this module. None is for rooms that are fitted: each room has its own losses,
+    without completeness, since a single image does not show how many objects the room holds
+    (supplement D).
+
+    Raises:
+        FloatingPointError: the weighted sum is not finite. This is checked before anything is
+            rendered, since the renderer's own error for vertices that are not finite names no room.
     """
-    per_room = completeness_target is None
+    slack, per_room = weights.occlusion_slack, completeness_target is None
+    matches = match_objects(scenes, boxes_2d, views, weights.match_box, slack)
     predicted = take(boxes_2d.boxes, matches.prediction, dim=2)
     inside = take(boxes_2d.in_frustum, matches.prediction, dim=2)
     centers = take(scenes.centers_m, matches.prediction, dim=1)
     seen = views.visible & matches.valid.unsqueeze(1)
-    completeness = {}
-    if completeness_target is not None:
-        completeness["completeness"] = completeness_loss(scenes, views, completeness_target)
-    return {
+    apart = (predicted, views.boxes, views.sides_clear, seen & inside)
+    losses = {
         "class": class_loss(scenes, views.object_class, matches, per_room),
-        "box": box_loss(
-            predicted, views.boxes, views.sides_clear, seen & inside, occlusion_slack, per_room
-        ),
-        **completeness,
-        "frustum": frustum_loss(centers, views, seen & ~inside, per_room),
+        "box": box_loss(*apart, slack, per_room),
     }
+    if completeness_target is not None:
+        losses["completeness"] = completeness_loss(scenes, views, completeness_target)
+    losses["frustum"] = frustum_loss(centers, views, seen & ~inside, per_room)
+    check_finite(weighted_sum(losses, weights).detach().sum(), views.room_ids)
+    return losses, matches
 
 
 def class_loss(
@@ -82,7 +88,7 @@ def box_loss(
     target: Float[Tensor, "rooms views objects 4"],
     clear: Bool[Tensor, "rooms views objects 4"],
     counted: Bool[Tensor, "rooms views objects"],
-    occlusion_slack: float = 1.0,
+    occlusion_slack: float,
     per_room: bool = False,
 ) -> Float[Tensor, "*rooms"]:
     """L_box of Eq. 7: L1 distance of 2D boxes (`side_distance`, summed over the four sides),
@@ -94,9 +100,7 @@ def box_loss(
     return _mean_of_views(torch.stack(apart).sum(dim=0), counted, per_room)
 
 
-def completeness_loss(
-    scenes: DecodedScenes, views: SceneViews, target: str = "first_n"
-) -> Float[Tensor, ""]:
+def completeness_loss(scenes: DecodedScenes, views: SceneViews, target: str) -> Float[Tensor, ""]:
     """L_p of Eq. 7: binary cross entropy of all completeness scores. `target` is the convention of
     their targets (`completeness_targets`)."""
     logits = scenes.completeness_logits
@@ -137,11 +141,36 @@ def _mean_of_views(
     return mean_of_objects(per_object, counted.any(dim=1), per_room)
 
 
+def seen_masks(
+    vertices_m: Float[Tensor, "rooms objects vertices 3"],
+    faces: Int[Tensor, "faces 3"],
+    views: SceneViews,
+    settings: ShapeConfig,
+) -> Float[Tensor, "rooms views objects height width"]:
+    """Soft visible masks of decoded objects, at the size of the views' instance ids.
+
+    In a room of n objects, only the first n predictions, which are matched, are rendered; the
+    others would occlude them.
+    """
+    height, width = views.observed_ids.shape[-2:]
+    return render_silhouettes(
+        vertices_m,
+        faces,
+        views.world_to_camera,
+        views.intrinsics_at(height, width),
+        (height, width),
+        sigma_px2=settings.sigma_px2,
+        mode=settings.silhouettes,
+        compositing=settings.compositing,
+        drawn=first_predictions(views, vertices_m.shape[1]),
+    )
+
+
 def mask_loss(
     rendered: Float[Tensor, "rooms views predictions height width"],
     views: SceneViews,
     matches: Matches,
-    iou_gate: float = 0.5,
+    iou_gate: float,
     per_room: bool = False,
 ) -> tuple[Float[Tensor, "*rooms"], dict[str, Float[Tensor, "*rooms"]]]:
     """Binary cross entropy of visible masks whose IoU with the observation is high enough (Eq. 8).
@@ -194,7 +223,7 @@ def soft_iou(
 
 
 def completeness_targets(
-    counts: Int[Tensor, " rooms"], slots: int, convention: str = "first_n"
+    counts: Int[Tensor, " rooms"], slots: int, convention: str
 ) -> Bool[Tensor, "rooms slots"]:
     """Target scores of `slots` predictions, in rooms of `counts` objects."""
     position = torch.arange(slots, device=counts.device)
@@ -204,7 +233,7 @@ def completeness_targets(
 
 
 def kept_objects(
-    logits: Float[Tensor, "rooms slots"], convention: str = "first_n"
+    logits: Float[Tensor, "rooms slots"], convention: str
 ) -> Bool[Tensor, "rooms slots"]:
     """Mask of the predictions that belong to the scene; a logit above 0 is a score above 0.5."""
     says_yes = (logits > 0).long()

@@ -1,13 +1,55 @@
-"""Hungarian matching of predictions to tracked objects (supplement B, Eq. S2 and S3)."""
+"""Predictions in views: their 2D boxes (section 3.4), and their Hungarian matching to tracked
+objects (supplement B, Eq. S2 and S3)."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn import functional as F
 
-from sceneprior.core.cameras import Boxes2D
+from sceneprior.core.cameras import Boxes2D, boxes_of_points
+from sceneprior.core.proxies import beveled_cube, boxes_of_ellipsoids, place
 from sceneprior.core.views import DecodedScenes, SceneViews
+
+
+def first_predictions(views: SceneViews, slots: int) -> Bool[Tensor, "rooms slots"]:
+    """Mask of the first n predictions of each room with n tracked objects: only these are
+    matched."""
+    return F.pad(views.is_object, (0, slots - views.is_object.shape[1]))
+
+
+def seen_boxes(
+    scenes: DecodedScenes, views: SceneViews, proxy: str, box_from: str = "proxy"
+) -> Boxes2D:
+    """2D boxes of decoded objects, computed from the shapes that `StageConfig.proxy` and
+    `ShapeConfig.box_from` name; those of objects without a mesh are computed from the proxy.
+
+    In a room with n tracked objects, only the first n predictions, which are matched, get a box;
+    the others get empty boxes, and count as outside the frustum.
+    """
+    project: Callable[..., Boxes2D] = boxes_of_points
+    boxes_m = (scenes.centers_m, scenes.sizes_m)
+    if scenes.vertices_m is not None and box_from == "mesh":
+        shapes: tuple[Tensor, ...] = (scenes.vertices_m,)
+    elif proxy == "ellipsoid":
+        project, shapes = boxes_of_ellipsoids, boxes_m
+    else:
+        assert scenes.bevels is not None, "decode() gives every object bevels"
+        shapes = (place(beveled_cube(scenes.bevels), *boxes_m),)
+    rooms, slots = scenes.centers_m.shape[:2]
+    first = first_predictions(views, slots)
+    room = first.nonzero()[:, 0]
+    # Each prediction is projected as a room with a single object.
+    cameras = (views.world_to_camera[room], views.intrinsics[room], views.image_size)
+    found = project(*(values[first].unsqueeze(1) for values in shapes), *cameras)
+    return Boxes2D(*(
+        of.new_zeros(rooms, slots, *of.shape[1:2], *of.shape[3:])
+        .index_put((first,), of[:, :, 0])
+        .transpose(1, 2)
+        for of in found
+    ))  # fmt: skip
 
 
 class Matches(NamedTuple):
@@ -27,7 +69,6 @@ def match_objects(
     views: SceneViews,
     box_weight: float = 5.0,
     occlusion_slack: float = 1.0,
-    first_n: bool = True,
 ) -> Matches:
     """Find the cheapest one-to-one assignment of predictions to tracked objects.
 
@@ -35,21 +76,18 @@ def match_objects(
         L^l = -p_k(l_j),    L^B = 1/|T_j| sum_p |b_k^p - b_j^p|_1     (Eq. S3)
 
     with 2D boxes b relative to the image size. In a room with n tracked objects, only the first n
-    predictions take part. If `first_n` is false, all predictions take part, because they have no
-    order. An object that is visible in no sampled view has zero cost: its match is arbitrary and
-    enters no loss. `box_weight` is lambda_B; `occlusion_slack` is explained in `side_distance`.
+    predictions take part. An object that is visible in no sampled view has zero cost: its match is
+    arbitrary and enters no loss. `box_weight` is lambda_B; `occlusion_slack` is explained in
+    `side_distance`.
     """
     cost = matching_cost(scenes, boxes_2d, views, box_weight, occlusion_slack)
     counts = views.is_object.sum(dim=-1)
-    slots = cost.shape[1]
-    if int(counts.max()) > slots:
+    if (most := int(counts.max())) > cost.shape[1]:
         raise ValueError(
-            f"A room holds {int(counts.max())} tracked objects but the prior generates "
-            f"{slots}; set model.max_objects to at least {int(counts.max())}."
+            f"A room holds {most} tracked objects but the prior generates {cost.shape[1]}; set "
+            f"model.max_objects to at least {most}."
         )
-    objects = counts.tolist()
-    predictions = objects if first_n else [slots] * len(objects)
-    prediction = assign(cost, predictions, objects)
+    prediction = assign(cost, counts.tolist(), counts.tolist())
     return Matches(prediction, views.is_object & views.visible.any(dim=1))
 
 

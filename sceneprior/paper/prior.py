@@ -1,5 +1,8 @@
-"""The whole prior, s = f(z) (Eq. 1): from logits or latents to decoded scenes, and as trained."""
+"""The prior s = f(z) (Eq. 1): latents z of the hypersphere (section 3.1, Eq. 2), the network that
+decodes them, its settings, and the prior as trained."""
 
+import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
@@ -8,16 +11,142 @@ import torch
 from jaxtyping import Bool, Float, Int
 from pydantic import Field, model_validator
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from sceneprior.core.dataset import ViewDataset
 from sceneprior.core.errors import InputError
 from sceneprior.core.settings import Section
 from sceneprior.core.views import DecodedScenes
-from sceneprior.paper.decoders import ClassBevels, LayoutDecoder
-from sceneprior.paper.latents import CubeConfig, LatentSpace, SphereConfig
-from sceneprior.paper.layers import DecoderConfig, ShapeModule, ShapeModuleConfig
-from sceneprior.paper.settings import LossConfig, ShapeConfig
-from sceneprior.training.method import RunConfig, Trained, ready_copy
+from sceneprior.paper.decoders import ClassBevels, LayoutDecoder, ShapeModule, ShapeModuleConfig
+from sceneprior.paper.transformer import DecoderConfig
+from sceneprior.training.method import RunConfig, ready_copy
+
+
+class SphereConfig(Section):
+    """The paper's hypersphere."""
+
+    name: Literal["sphere"] = "sphere"
+    anchors: int = Field(100, ge=2)
+    """M, the number of fixed unit vectors of which latents are mixtures; 100 in the authors'
+    code."""
+
+    def build(self, dimension: int, seed: int) -> "LatentSphere":
+        return LatentSphere(self.anchors, dimension, seed)
+
+
+class CubeConfig(Section):
+    """A cube with one logit per coordinate: ablation c1. `distribution: paper` is uniform in it."""
+
+    name: Literal["cube"] = "cube"
+
+    def build(self, dimension: int, seed: int) -> "LatentCube":
+        return LatentCube(dimension)
+
+
+class _Space(nn.Module, ABC):
+    @abstractmethod
+    def onto(self, points: Tensor) -> Tensor:
+        """The nearest point of the latent space to each given point of the surrounding R^D_z."""
+
+    def step(
+        self, z: Float[Tensor, "rooms dimension"], length: float, seed: int
+    ) -> Float[Tensor, "rooms dimension"]:
+        """Move each point by a random step of about `length`; the same seed gives the same
+        steps."""
+        generator = torch.Generator().manual_seed(seed)
+        steps = torch.randn(z.shape, generator=generator).to(z) * (length / z.shape[-1] ** 0.5)
+        return self.onto(z + steps)
+
+
+class LatentSphere(_Space):
+    """Map weights w_i of M fixed unit vectors phi_i to a point z of the hypersphere (Eq. 2).
+
+        z = sum_i w_i phi_i / |sum_i w_i phi_i|,    w = softmax(logits)
+
+    Adding a constant to all logits of a room does not change z, hence `shift_free`. `seed`
+    determines the anchors phi_i, which are drawn at random and stored with the model.
+    """
+
+    shift_free = True
+
+    def __init__(self, anchors: int, dimension: int, seed: int = 0):
+        super().__init__()
+        self.anchors: Tensor
+        generator = torch.Generator().manual_seed(seed)
+        # Normalised Gaussians are uniform on the sphere.
+        vectors = torch.randn(anchors, dimension, generator=generator)
+        self.register_buffer("anchors", F.normalize(vectors, dim=-1))
+
+    def forward(self, logits: Float[Tensor, "rooms anchors"]) -> Float[Tensor, "rooms dimension"]:
+        """Latents z of rooms (Eq. 2); the weights w_i are positive and sum to 1."""
+        return F.normalize(logits.softmax(dim=-1) @ self.anchors, dim=-1)
+
+    def onto(self, points: Float[Tensor, "rooms dimension"]) -> Float[Tensor, "rooms dimension"]:
+        return F.normalize(points, dim=-1)
+
+    def between(
+        self,
+        start: Float[Tensor, " dimension"],
+        end: Float[Tensor, " dimension"],
+        along: Float[Tensor, " points"],
+    ) -> Float[Tensor, "points dimension"]:
+        """The points at places `along` (0 to 1) of the geodesic between two unit vectors (section
+        5.3).
+
+        Raises:
+            InputError: the two are opposite, so that no geodesic is the shortest.
+        """
+        # Not acos of the dot product: in float32 it cannot resolve angles between pi - 3e-4 and pi.
+        apart, together = (start - end).norm(dim=-1), (start + end).norm(dim=-1)
+        angle = 2 * torch.atan2(apart, together)
+        if angle > torch.pi - 1e-4:
+            raise InputError(
+                "The two ends are opposite points of the sphere, and every great circle leads from "
+                "one to the other; choose another end, or go by way of a third room."
+            )
+        t = along.unsqueeze(-1)
+        # If the two nearly coincide, sin(angle) vanishes, and the chord replaces the geodesic.
+        straight = F.normalize(torch.lerp(start, end, t), dim=-1)
+        turned = torch.sin((1 - t) * angle) * start + torch.sin(t * angle) * end
+        return torch.where(angle < 1e-3, straight, turned / torch.sin(angle).clamp(min=1e-6))
+
+
+class LatentCube(_Space):
+    """Map one logit per coordinate to a point of a cube around the origin: ablation c1.
+
+        z_i = a * (2 * Phi(logit_i) - 1),    a = sqrt(3 / D_z)
+
+    Phi is the cumulative distribution function of N(0, 1), so logits from N(0, 1) give points that
+    are uniform in the cube. The half edge a makes their mean square length 1, the scale of latents
+    on the sphere.
+
+    The paper says only 'uniform latent space parameterization'; this is our reading of it.
+    """
+
+    shift_free = False
+
+    def __init__(self, dimension: int):
+        super().__init__()
+        self.half_edge = math.sqrt(3 / dimension)
+
+    def forward(self, logits: Float[Tensor, "rooms dimension"]) -> Float[Tensor, "rooms dimension"]:
+        """Points z of the cube; 2 Phi(x) - 1 = erf(x / sqrt(2))."""
+        return self.half_edge * torch.erf(logits / math.sqrt(2))
+
+    def onto(self, points: Float[Tensor, "rooms dimension"]) -> Float[Tensor, "rooms dimension"]:
+        return points.clamp(-self.half_edge, self.half_edge)
+
+    def between(
+        self,
+        start: Float[Tensor, " dimension"],
+        end: Float[Tensor, " dimension"],
+        along: Float[Tensor, " points"],
+    ) -> Float[Tensor, "points dimension"]:
+        """The points at places `along` (0 to 1) of the straight line between two points."""
+        return torch.lerp(start, end, along.unsqueeze(-1))
+
+
+LatentSpace = LatentSphere | LatentCube
 
 
 class ModelConfig(Section):
@@ -125,15 +254,6 @@ class PriorConfig(RunConfig):
         """Default distribution of new latents."""
         return "paper"
 
-    @property
-    def view_terms(self) -> tuple[LossConfig, ShapeConfig | None]:
-        """Settings of the view loss for fitting latents to images: its weights, and how shapes are
-        rendered (None: not at all).
-
-        They are the paper's defaults, unless the run itself is trained on views.
-        """
-        return LossConfig(), None
-
     def build_prior(self) -> ScenePrior:
         """The network, freshly initialised from the seed."""
         torch.manual_seed(self.seed)
@@ -210,27 +330,3 @@ class TrainedPrior:
         """Default distribution of new latents: the run's own, or `paper` if the prior lacks the
         latents of its training rooms, as a packed prior may."""
         return self.config.distribution if self.remembers_rooms else "paper"
-
-
-SHIPPED_WITH_LATENTS = "`demo-bedroom`, which comes with the package and has them"
-"""The shipped prior that keeps the latents of its training rooms, for messages."""
-
-
-def with_training_latents(trained: Trained, purpose: str) -> TrainedPrior:
-    """Return `trained` if it keeps the latents of its training rooms.
-
-    Raises:
-        InputError: it does not; the message names the `purpose`, and priors that keep them.
-    """
-    if isinstance(trained, TrainedPrior) and trained.remembers_rooms:
-        return trained
-    if trained.config.remembers_rooms:
-        raise InputError(
-            f"{purpose} needs the latents of training rooms, and this prior was packed without "
-            "them; take the run that it was packed from, a prior packed with `sceneprior pack "
-            f"--latents`, or {SHIPPED_WITH_LATENTS}."
-        )
-    raise InputError(
-        f"{purpose} needs the latents of training rooms, and a run of `method: "
-        f"{trained.config.method}` keeps none; take a run of `method: paper` or `method: lifted`."
-    )

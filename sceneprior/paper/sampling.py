@@ -1,24 +1,28 @@
-"""Latents of rooms: sampled around the training rooms, read by name, and written to files."""
+"""Latents of rooms, sampled, named by the user or read from files, and the scenes that they decode
+to."""
 
 import io
-import json
 import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.errors import InputError, InputWarning
 from sceneprior.core.files import write_whole
-from sceneprior.core.repeatable import check_seed
-from sceneprior.core.scene import Scene
-from sceneprior.paper.latents import LatentSpace
-from sceneprior.paper.prior import SHIPPED_WITH_LATENTS, TrainedPrior
+from sceneprior.core.repeatable import check_seed, single_threaded
+from sceneprior.core.scene import Scene, SceneObject
+from sceneprior.core.views import DecodedScenes
+from sceneprior.paper.losses import kept_objects
+from sceneprior.paper.prior import ScenePrior, TrainedPrior
+from sceneprior.training.method import Trained
 
 BANDWIDTH = 0.15
 """Bandwidth of the kernel distribution, in standard deviations of the training rooms' logits: 0
@@ -26,8 +30,6 @@ copies training rooms, 1 is one Gaussian fitted to all. A larger bandwidth gives
 but also more rooms without a bed, or with two."""
 DISTRIBUTIONS = ("kernel", "paper")
 """Distributions that latents of new rooms can be sampled from; see `sample_logits`."""
-MARKS = {"kernel": "copies: near training rooms"}
-"""Notes that tables add to the name of a distribution whose rooms are near training rooms."""
 COPIES = (
     "The distribution `kernel` draws close to single training rooms: nine in ten of its rooms are "
     "near copies of one. The distribution `paper` takes nothing from single training rooms."
@@ -36,37 +38,43 @@ COPIES = (
 LATENTS_FILE = "latents.npz"
 Point = str | Scene | Float[Tensor, " dimension"] | Float[np.ndarray, " dimension"]
 """Anything that determines a point of a latent space; see `latent_of`."""
-_ENDINGS = (".npz", ".npy", ".json")
+SHIPPED_WITH_LATENTS = "`demo-bedroom`, which comes with the package and has them"
+"""The shipped prior that keeps the latents of its training rooms, for messages."""
+BATCH = 64
+"""Rooms decoded at a time."""
 
 
 def marked(distribution: str) -> str:
-    """A distribution's name as tables show it, followed by its note in `MARKS`, if it has one."""
-    mark = MARKS.get(distribution)
-    return distribution if mark is None else f"{distribution}, {mark}"
+    """A distribution's name as tables show it; that of `kernel` with a note."""
+    note = ", copies: near training rooms" if distribution == "kernel" else ""
+    return f"{distribution}{note}"
 
 
-def sample_latents(
-    space: LatentSpace,
-    trained: Float[Tensor, "rooms anchors"],
-    count: int,
-    seed: int,
-    distribution: str = "paper",
+def draw_latents(
+    trained: TrainedPrior, count: int, seed: int, distribution: str | None = None
 ) -> Float[Tensor, "count dimension"]:
-    """Sample `count` points of the latent space; the same seed gives the same points.
+    """Sample `count` latents; the same seed gives the same latents.
 
-    `trained` holds the logits of the training rooms; `sample_logits` describes the distributions.
+    `sample_logits` describes the distributions; None is the run's own. The distribution `kernel`
+    gives a warning that its rooms are near copies (`COPIES`).
     """
+    distribution = distribution or trained.latent_distribution
     if distribution not in DISTRIBUTIONS:
         raise InputError(
             f"No sampling distribution '{distribution}'; choose from {', '.join(DISTRIBUTIONS)}."
         )
-    if distribution != "paper" and len(trained) < 2:
+    if distribution != "paper" and len(trained.logits) < 2:
         raise InputError(
             f"The {distribution} distribution needs the latents of at least 2 training rooms, and "
-            f"this prior keeps {len(trained)} (a packed one keeps them if packed with --latents); "
-            f"use --distribution paper, leave it out, or take {SHIPPED_WITH_LATENTS}."
+            f"this prior keeps {len(trained.logits)} (a packed one keeps them if packed with "
+            "--latents); use --distribution paper, leave it out, or take "
+            f"{SHIPPED_WITH_LATENTS}."
         )
-    return space(sample_logits(trained, count, seed, distribution, space.shift_free))
+    space = trained.prior.latent_space
+    z = space(sample_logits(trained.logits, count, seed, distribution, space.shift_free))
+    if distribution == "kernel":
+        warnings.warn(COPIES, InputWarning, stacklevel=1)
+    return z
 
 
 def sample_logits(
@@ -74,9 +82,9 @@ def sample_logits(
     count: int,
     seed: int,
     distribution: str,
-    shift_free: bool = True,
+    shift_free: bool,
 ) -> Float[Tensor, "count anchors"]:
-    """Sample logits of latent weights for `sample_latents`.
+    """Sample logits of latent weights for `draw_latents`.
 
     Args:
         distribution: `paper`: N(0, 1), from which the training rooms' logits were initialised;
@@ -107,21 +115,6 @@ def sample_logits(
     return (mean + drawn).to(trained.dtype)
 
 
-def draw_latents(
-    trained: TrainedPrior, count: int, seed: int, distribution: str | None = None
-) -> tuple[Float[Tensor, "count dimension"], list[str]]:
-    """Sample latents from a distribution (None: the run's own); also return the rooms' names.
-
-    The distribution `kernel` gives a warning that its rooms are near copies (`COPIES`).
-    """
-    space = trained.prior.latent_space
-    distribution = distribution or trained.latent_distribution
-    z = sample_latents(space, trained.logits, count, seed, distribution)
-    if distribution == "kernel":
-        warnings.warn(COPIES, InputWarning, stacklevel=1)
-    return z, scene_names(count, seed)
-
-
 def scene_names(count: int, seed: int) -> list[str]:
     """Names of generated rooms."""
     return [f"seed{seed}_{index:04d}" for index in range(count)]
@@ -138,6 +131,26 @@ def write_latents(folder: Path, scenes: Sequence[Scene]) -> None:
     buffer = io.BytesIO()
     np.savez(buffer, latents=np.stack(latents), names=np.array([scene.name for scene in scenes]))
     write_whole(Path(folder) / LATENTS_FILE, buffer.getvalue())
+
+
+def with_training_latents(trained: Trained, purpose: str) -> TrainedPrior:
+    """Return `trained` if it keeps the latents of its training rooms.
+
+    Raises:
+        InputError: it does not; the message names the `purpose`, and priors that keep them.
+    """
+    if isinstance(trained, TrainedPrior) and trained.remembers_rooms:
+        return trained
+    if trained.config.remembers_rooms:
+        raise InputError(
+            f"{purpose} needs the latents of training rooms, and this prior was packed without "
+            "them; take the run that it was packed from, a prior packed with `sceneprior pack "
+            f"--latents`, or {SHIPPED_WITH_LATENTS}."
+        )
+    raise InputError(
+        f"{purpose} needs the latents of training rooms, and a run of `method: "
+        f"{trained.config.method}` keeps none; take a run of `method: paper` or `method: lifted`."
+    )
 
 
 def latent_of(trained: TrainedPrior, point: Point) -> Float[Tensor, " dimension"]:
@@ -177,14 +190,24 @@ def read_latent(trained: TrainedPrior, text: str) -> Float[Tensor, " dimension"]
     - the id of a training room;
     - `seed:7`, for the room that `synthesize -n 1 --seed 7` makes from latents; `paper:7` and
       `kernel:7` also name the distribution;
-    - a file of latents: `FILE` (its first latent), `FILE:3` (counted from 0) or `FILE:NAME`. The
-      file is a `latents.npz`, an .npy of (D,) or (n, D) numbers, or a .json of such lists.
+    - a file of latents, as `write_latents` writes it: `FILE` (its first latent), `FILE:3` (counted
+      from 0) or `FILE:NAME`.
     """
     file, _, item = text.rpartition(":")
-    path, item = (Path(file), item) if file.endswith(_ENDINGS) else (Path(text), "0")
+    path, item = (Path(file), item) if file.endswith(".npz") else (Path(text), "0")
     if text in trained.room_ids or not path.is_file():
-        return named_latent(trained, text, f"a file of latents ({', '.join(_ENDINGS)})")
-    latents, names = _read_latents(path)
+        return named_latent(trained, text, "a file of latents (.npz)")
+    try:
+        with np.load(path) as data:
+            latents = np.asarray(data["latents"], dtype=np.float64)
+            names = [str(name) for name in data.get("names", [])]
+        if latents.ndim != 2 or not latents.size:
+            raise ValueError(f"an array of shape {latents.shape}")
+    except Exception as error:  # NumPy's error depends on which byte is damaged
+        raise InputError(
+            f"{path} holds no latents ({type(error).__name__}: {error}); expected (n, D) numbers, "
+            "as in the latents.npz that `sceneprior synthesize` writes."
+        ) from None
     if item in names:
         row = names.index(item)
     elif item.isdecimal() and int(item) < len(latents):
@@ -207,7 +230,7 @@ def named_latent(trained: TrainedPrior, name: str, or_else: str) -> Float[Tensor
     if (found := re.fullmatch(rf"(seed|{'|'.join(DISTRIBUTIONS)}):(\d+)", name)) is not None:
         distribution, seed = None if found[1] == "seed" else found[1], int(found[2])
         check_seed(seed)
-        return draw_latents(trained, 1, seed, distribution)[0][0]
+        return draw_latents(trained, 1, seed, distribution)[0]
     others = f"seed:NUMBER ({', '.join(f'{each}:NUMBER' for each in DISTRIBUTIONS)}), nor {or_else}"
     if not trained.room_ids and trained.config.remembers_rooms:
         raise InputError(
@@ -218,21 +241,108 @@ def named_latent(trained: TrainedPrior, name: str, or_else: str) -> Float[Tensor
     raise InputError(f"'{name}' is neither a training room of this run ({known}), nor {others}.")
 
 
-def _read_latents(path: Path) -> tuple[np.ndarray, list[str]]:
-    try:
-        raw = path.read_bytes()
-        data: Any = json.loads(raw) if path.suffix == ".json" else np.load(io.BytesIO(raw))
-        names: list[str] = []
-        if isinstance(data, Mapping):
-            if "latents" not in data:
-                raise ValueError("it has no 'latents'")
-            data, names = data["latents"], [str(name) for name in data.get("names", [])]
-        latents = np.atleast_2d(np.asarray(data, dtype=np.float64))
-        if latents.ndim != 2 or not latents.size:
-            raise ValueError(f"an array of shape {latents.shape}")
-    except Exception as error:  # NumPy's error depends on which byte is damaged
-        raise InputError(
-            f"{path} holds no latents ({type(error).__name__}: {error}); expected (n, D) numbers, "
-            "as in the latents.npz that `sceneprior synthesize` writes."
-        ) from None
-    return latents, names
+class DecodedRoom(NamedTuple):
+    """A decoded scene, with the predictions that its objects come from and their class logits."""
+
+    scene: Scene
+    predictions: list[int]
+    """Index of each object's prediction among the network's N."""
+    class_logits: Float[Tensor, "objects classes"]
+
+
+def kept_predictions(decoded: DecodedScenes, target: str) -> Bool[Tensor, "rooms objects"]:
+    """True for predictions that are objects: the completeness scores keep them, and their most
+    likely class is not `void`."""
+    kept = kept_objects(decoded.completeness_logits, target)
+    return kept & (decoded.class_logits.argmax(dim=-1) != VOID)
+
+
+def to_rooms(
+    decoded: DecodedScenes,
+    prior: ScenePrior,
+    label_set_name: str,
+    names: Sequence[str],
+    completeness_target: str,
+) -> list[DecodedRoom]:
+    """Convert decoded rooms to scenes of their `kept_predictions`, with their most likely classes.
+
+    `prior` is the network that decoded the rooms.
+    """
+    kept = kept_predictions(decoded, completeness_target)
+    rooms = []
+    for row, name in enumerate(names):
+        predictions = kept[row].nonzero()[:, 0].tolist()
+        scene = scene_of(decoded, row, predictions, prior, label_set_name, name)
+        rooms.append(DecodedRoom(scene, predictions, decoded.class_logits[row, predictions]))
+    return rooms
+
+
+def scene_of(
+    decoded: DecodedScenes,
+    row: int,
+    predictions: Sequence[int],
+    prior: ScenePrior,
+    label_set_name: str,
+    name: str,
+) -> Scene:
+    """A scene of the given predictions of one room, in the given order.
+
+    An object has its most likely class other than void, and a mesh if shapes were decoded.
+    """
+    classes = label_set(label_set_name)
+    objects = []
+    for item in predictions:
+        logits = decoded.class_logits[row, item].clone()
+        logits[VOID] = -torch.inf
+        center, size = (part[row, item].tolist() for part in (decoded.centers_m, decoded.sizes_m))
+        mesh = prior.shape.mesh_of(decoded, row, item)
+        solids = prior.shape.solids_of(decoded, row, item)
+        label = classes[int(logits.argmax())]
+        objects.append(SceneObject(label, tuple(center), tuple(size), mesh, solids=solids))
+    return Scene(name, label_set_name, tuple(objects))
+
+
+@single_threaded()
+@torch.no_grad()
+def decode_rooms(
+    trained: TrainedPrior,
+    z: Float[Tensor, "rooms width"],
+    names: Sequence[str],
+    reshaped: Callable[[DecodedScenes, slice], DecodedScenes] = lambda decoded, rows: decoded,
+) -> list[DecodedRoom]:
+    """Decode latents into rooms, with meshes unless the run has only trained its layout stage.
+
+    `reshaped` may change the shapes of some of the rooms before they become scenes.
+
+    Decoding runs on one thread: the networks are too small to gain from several, and on one thread
+    equal latents give bit-identical rooms.
+    """
+    config = trained.config
+    rooms: list[DecodedRoom] = []
+    for start in range(0, len(z), BATCH):
+        part = slice(start, start + BATCH)
+        decoded = trained.prior.decode(z[part], with_shape=trained.stage != "layout")
+        target = config.model.completeness_target
+        decoded = reshaped(decoded, part)
+        rooms += to_rooms(decoded, trained.prior, config.label_set, names[part], target)
+    return [
+        room._replace(scene=replace(room.scene, latent=point.cpu().numpy()))
+        for room, point in zip(rooms, z, strict=True)
+    ]
+
+
+def decode_latents(
+    trained: TrainedPrior, z: Float[Tensor, "rooms width"], names: Sequence[str]
+) -> list[Scene]:
+    """The scenes of `decode_rooms`."""
+    return [room.scene for room in decode_rooms(trained, z, names)]
+
+
+def decode_training_rooms(trained: Trained) -> list[Scene]:
+    """Decode the training rooms from their own latents; a scene's name is the room's id.
+
+    Raises:
+        InputError: the run keeps no latents of its training rooms.
+    """
+    prior = with_training_latents(trained, "Decoding training rooms")
+    return decode_latents(prior, prior.prior.latent_space(prior.logits), prior.room_ids)

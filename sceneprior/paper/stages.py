@@ -12,7 +12,8 @@ from torch.utils.data import Dataset
 
 from sceneprior.core.settings import Section
 from sceneprior.core.views import SceneViews
-from sceneprior.paper.losses import mask_loss
+from sceneprior.paper.losses import layout_losses, mask_loss, seen_masks
+from sceneprior.paper.matching import seen_boxes
 from sceneprior.paper.prior import ScenePrior
 from sceneprior.paper.settings import (
     LatentStageConfig,
@@ -22,7 +23,6 @@ from sceneprior.paper.settings import (
     StageConfig,
     Steps,
 )
-from sceneprior.paper.view_loss import match_and_score, proxy_boxes, seen_boxes, seen_masks
 from sceneprior.training.steps import (
     batch_seed,
     check_finite,
@@ -127,8 +127,8 @@ class LayoutStage(LatentStage):
     def training_step(self, views: SceneViews, batch_idx: int) -> Tensor:
         scenes = self.prior.decode(self.room_latents(views.room_index, batch_idx), False)
         with full_precision(self.device):
-            boxes = proxy_boxes(scenes, views, self.stage.proxy)
-            losses, _ = match_and_score(scenes, boxes, views, self.loss, self.completeness_target)
+            boxes = seen_boxes(scenes, views, self.stage.proxy)
+            losses, _ = layout_losses(scenes, boxes, views, self.loss, self.completeness_target)
             return self.total(losses, len(views.room_index))
 
 
@@ -147,8 +147,8 @@ class ShapeStage(LatentStage):
         z = self.room_latents(views.room_index, batch_idx)
         scenes = self.prior.decode(z, views.is_object)
         with full_precision(self.device):
-            boxes = seen_boxes(scenes, views, self.stage)
-            losses, matches = match_and_score(
+            boxes = seen_boxes(scenes, views, self.stage.proxy, self.stage.box_from)
+            losses, matches = layout_losses(
                 scenes, boxes, views, self.loss, self.completeness_target
             )
             faces = self.prior.faces

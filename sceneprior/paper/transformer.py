@@ -1,23 +1,35 @@
 """The permutation-invariant transformer: object features x_k from z (section 3.2, Eq. 3 and 4)."""
 
+import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float, Int
 from pydantic import Field
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from sceneprior.paper.layers import (
-    DecoderConfig,
-    QuerySelfAttention,
-    RepeatedLinear,
-    StepOutputs,
-    dropout,
-)
+from sceneprior.core.settings import Section
 
 Layer = Callable[[Tensor], Tensor]
+
+
+class DecoderConfig(Section, ABC):
+    """A config section that builds the decoder from a latent z to object features x_k.
+
+    The module maps (z of shape (rooms, D_z), N) to features of shape (rooms, N, D_z). It also
+    accepts the number of features that each room needs; features beyond that number are
+    meaningless.
+    """
+
+    name: str
+
+    @abstractmethod
+    def build(self, width: int, max_objects: int) -> nn.Module:
+        """The module for features of D_z = `width`, freshly initialised."""
 
 
 class TransformerConfig(DecoderConfig):
@@ -42,28 +54,6 @@ class TransformerConfig(DecoderConfig):
 
     def build(self, width: int, max_objects: int) -> "SceneTransformer":
         return SceneTransformer(width, self, max_objects)
-
-
-class FeedForward(nn.Module):
-    """MLP[hidden, width] with GELU, a residual connection and a layer norm (supplement A)."""
-
-    def __init__(self, width: int, hidden: int, dropout: float):
-        super().__init__()
-        self.expand = nn.Linear(width, hidden)
-        self.contract = nn.Linear(hidden, width)
-        self.norm = nn.LayerNorm(width)
-        self.dropout = dropout
-
-    def repeated(self, rows: Sequence[int]) -> Layer:
-        """This block as a function for several inputs in turn, whose numbers of rows are `rows`."""
-        expand, contract = (repeated(layer, rows) for layer in (self.expand, self.contract))
-        p = self.dropout if self.training else 0.0
-
-        def forward(x: Tensor) -> Tensor:
-            inner = dropout(F.gelu(expand(x)), p)
-            return self.norm(x + dropout(contract(inner), p))
-
-        return forward
 
 
 class SceneTransformer(nn.Module):
@@ -110,7 +100,13 @@ class SceneTransformer(nn.Module):
         self.query: nn.Module = nn.Identity()
         if config.query_self_attention:
             self.query = QuerySelfAttention(width, config.heads, config.dropout)
-        self.output = StepOutputs(max_objects, width) if config.step_mlps else None
+        self.output: nn.ModuleDict | None = None
+        if config.step_mlps:  # the output of step k's MLP is x_k, which later steps read, too
+            steps = [
+                nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, width))
+                for _ in range(max_objects)
+            ]
+            self.output = nn.ModuleDict({"mlps": nn.ModuleList(steps)})
 
     def forward(
         self,
@@ -130,90 +126,67 @@ class SceneTransformer(nn.Module):
             return self._unroll(z[order], going_on)[order.argsort()]
         return self._unroll(z, [len(z)] * objects)
 
-    def _unroll(self, z: Tensor, going_on: list[int]) -> Tensor:
-        """Object features; step k computes only the first `going_on[k]` rooms and leaves zeros
+    def _unroll(self, z: Tensor, rows: list[int]) -> Tensor:
+        """Object features; step k computes only the first `rows[k]` rooms and leaves zeros
         elsewhere."""
-        read, encode = self._reader(going_on), self._encoder(going_on)
-        decode = self._decoder(going_on)
-        query = self._query(z)
-        key_query = self._key_query(query)
+        heads = self.heads
+        encoder_qkv = repeated(self.encoder_qkv, rows)
+        encoder_out = RepeatedLinear(
+            self.encoder_out.weight.T.unflatten(0, (heads, -1)), None, rows
+        )
+        encoder_ff = self.encoder_ff.repeated([k * rooms for k, rooms in enumerate(rows, 1)])
+        weight = self.decoder_value.weight.unflatten(0, (heads, -1)).transpose(1, 2)
+        decoder_value = RepeatedLinear(weight, self.decoder_value.bias.view(heads, -1), rows)
+        decoder_out, decoder_ff = repeated(self.decoder_out, rows), self.decoder_ff.repeated(rows)
+        query, key_query = self.queries(z)
         newest = self.start.expand(len(z), -1)
         known: list[Tensor] = []
         features: list[Tensor] = []
-        for step, rooms in enumerate(going_on):
+        for step, rooms in enumerate(rows):
             query, key_query, newest, *known = (
                 _first(each, rooms) for each in (query, key_query, newest, *known)
             )
-            added = read(newest)
+            # The newest object as a token, (rooms, 1, width), and its query, key, and value times
+            # the output projection, (rooms, heads, 1, *), are appended to those of the others.
+            asks, key, value = encoder_qkv(newest).unflatten(-1, (3, heads, -1)).unbind(1)
+            value = encoder_out(value.transpose(0, 1)).transpose(0, 1)
+            added = [newest.unsqueeze(1), *(part.unsqueeze(2) for part in (asks, key, value))]
             if known:
                 added = [torch.cat(both, dim=-2) for both in zip(known, added, strict=True)]
             known = added
-            newest = decode(query, key_query, encode(*known))
-            if self.output is not None:
-                newest = self.output(newest, step)
-            features.append(newest)
-        return torch.stack([F.pad(x, (0, 0, 0, len(z) - len(x))) for x in features], dim=1)
-
-    def _query(self, z: Tensor) -> Tensor:
-        """(rooms, width): z as the query of every step.
-
-        Coordinates of a unit vector are about 1 / sqrt(width), far below the normalised features to
-        which they are added, so z is scaled by sqrt(width). Without this scaling, the class loss
-        falls far more slowly (git show 05a7b7d2:docs/experiments/2026-11-21-demo-settings.md).
-        """
-        return self.query(z * z.shape[-1] ** 0.5)
-
-    def _reader(self, rows: Sequence[int]) -> Callable[[Tensor], list[Tensor]]:
-        """Make a function that encodes the newest object x_k as a token, (rooms, 1, width), and its
-        queries, keys, and values times the output projection, (rooms, heads, 1, *)."""
-        project = repeated(self.encoder_qkv, rows)
-        output = self.encoder_out.weight.T.unflatten(0, (self.heads, -1))
-        projected = RepeatedLinear(output, None, rows)
-
-        def read(x: Tensor) -> list[Tensor]:
-            query, key, value = project(x).unflatten(-1, (3, self.heads, -1)).unbind(1)
-            value = projected(value.transpose(0, 1)).transpose(0, 1)
-            return [x.unsqueeze(1), *(part.unsqueeze(2) for part in (query, key, value))]
-
-        return read
-
-    def _encoder(self, rows: Sequence[int]) -> Callable[..., Tensor]:
-        """Make a function that maps all tokens of `_reader` to the scene context F_k."""
-        feed_forward = self.encoder_ff.repeated([k * rooms for k, rooms in enumerate(rows, 1)])
-
-        def encode(tokens: Tensor, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
-            # Attention is written out: on a dozen tokens torch's fused CPU attention is slower.
-            scores = query @ key.transpose(-1, -2) / query.shape[-1] ** 0.5
+            # Encoder layer: the scene context F_k. Attention is written out: on a dozen tokens
+            # torch's fused CPU attention is slower.
+            tokens, asks, key, value = known
+            scores = asks @ key.transpose(-1, -2) / asks.shape[-1] ** 0.5
             shares = self._drop(scores.softmax(dim=-1)).transpose(1, 2).flatten(2)
             mixed = torch.baddbmm(self.encoder_out.bias, shares, value.flatten(1, 2))
             context = self.encoder_norm(tokens + self._drop(mixed))
-            return self.encoder_end(feed_forward(context))
-
-        return encode
-
-    def _decoder(self, rows: Sequence[int]) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
-        """Make a function that maps z's queries and the context F_k to the next object x_k."""
-        value = self.decoder_value.weight.unflatten(0, (self.heads, -1)).transpose(1, 2)
-        values = RepeatedLinear(value, self.decoder_value.bias.view(self.heads, -1), rows)
-        out, feed_forward = repeated(self.decoder_out, rows), self.decoder_ff.repeated(rows)
-
-        def decode(z_query: Tensor, key_query: Tensor, context: Tensor) -> Tensor:
+            context = self.encoder_end(encoder_ff(context))
+            # Decoder layer: z queries the context for the next object x_k.
             weights = self._drop((key_query @ context.transpose(1, 2)).softmax(dim=-1))
-            mixed = values((weights @ context).transpose(0, 1)).transpose(0, 1).flatten(1)
-            x = z_query + self._drop(out(mixed))
-            return self.decoder_end(feed_forward(self.decoder_norm(x)))
+            mixed = decoder_value((weights @ context).transpose(0, 1)).transpose(0, 1).flatten(1)
+            x = self.decoder_norm(query + self._drop(decoder_out(mixed)))
+            newest = self.decoder_end(decoder_ff(x))
+            if self.output is not None:
+                newest = self.output.mlps[step](newest)
+            features.append(newest)
+        return torch.stack([F.pad(x, (0, 0, 0, len(z) - len(x))) for x in features], dim=1)
 
-        return decode
+    def queries(
+        self, z: Float[Tensor, "rooms width"]
+    ) -> tuple[Float[Tensor, "rooms width"], Float[Tensor, "rooms heads width"]]:
+        """z as the query of every step, and each head's query multiplied by the key projection.
 
-    def _key_query(self, z_query: Tensor) -> Tensor:
-        """(rooms, heads, width): each head's query from z, multiplied by the key projection.
-
-        A bias of the key would add the same number to the scores of all tokens, which the softmax
+        Coordinates of a unit vector are about 1 / sqrt(width), far below the normalised features to
+        which they are added, so z is scaled by sqrt(width). Without this scaling, the class loss
+        falls far more slowly (git show 05a7b7d2:docs/experiments/2026-11-21-demo-settings.md). A
+        bias of the key would add the same number to the scores of all tokens, which the softmax
         cancels.
         """
-        query = self.decoder_query(z_query).unflatten(-1, (self.heads, -1))
+        query = self.query(z * z.shape[-1] ** 0.5)
+        own = self.decoder_query(query).unflatten(-1, (self.heads, -1))
         key = self.decoder_key.unflatten(0, (self.heads, -1))
-        return torch.einsum("rhd,hdw->rhw", query, key) / query.shape[-1] ** 0.5
+        return query, torch.einsum("rhd,hdw->rhw", own, key) / own.shape[-1] ** 0.5
 
     def _drop(self, x: Tensor) -> Tensor:
         return dropout(x, self.dropout if self.training else 0.0)
@@ -225,7 +198,126 @@ def _first(values: Tensor, rooms: int) -> Tensor:
     return values if len(values) == rooms else values[:rooms]
 
 
+class FeedForward(nn.Module):
+    """MLP[hidden, width] with GELU, a residual connection and a layer norm (supplement A)."""
+
+    def __init__(self, width: int, hidden: int, dropout: float):
+        super().__init__()
+        self.expand = nn.Linear(width, hidden)
+        self.contract = nn.Linear(hidden, width)
+        self.norm = nn.LayerNorm(width)
+        self.dropout = dropout
+
+    def repeated(self, rows: Sequence[int]) -> Layer:
+        """This block as a function for several inputs in turn, whose numbers of rows are `rows`."""
+        expand, contract = (repeated(layer, rows) for layer in (self.expand, self.contract))
+        p = self.dropout if self.training else 0.0
+
+        def forward(x: Tensor) -> Tensor:
+            inner = dropout(F.gelu(expand(x)), p)
+            return self.norm(x + dropout(contract(inner), p))
+
+        return forward
+
+
+class QuerySelfAttention(nn.Module):
+    """The decoder layer's self-attention over its single query z: a residual layer and its norm.
+
+    The softmax over a single score is always 1, so the layer has no query and key projections.
+    """
+
+    def __init__(self, width: int, heads: int, dropout: float):
+        super().__init__()
+        self.heads = heads
+        self.value = nn.Linear(width, width)
+        self.out = nn.Linear(width, width)
+        self.norm = nn.LayerNorm(width)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, z: Float[Tensor, "rooms width"]) -> Float[Tensor, "rooms width"]:
+        share = self.dropout(z.new_ones(len(z), self.heads, 1))  # one attention weight per head
+        value = (share * self.value(z).unflatten(-1, (self.heads, -1))).flatten(1)
+        return self.norm(z + self.dropout(self.out(value)))
+
+
+def dropout(x: Float[Tensor, "*shape"], p: float) -> Float[Tensor, "*shape"]:
+    """Set each number to 0 with probability `p` and divide the others by 1 - p, as `F.dropout` in
+    training.
+
+    On a CPU, this function samples the positions of the zeros instead of deciding for every number,
+    which takes a quarter of the time. For n numbers, Poisson(-n ln(1 - p)) positions are drawn
+    uniformly with replacement. Each number is then drawn Poisson(-ln(1 - p)) times, independently
+    of the others, so the probability that it is never drawn is 1 - p.
+    """
+    if p == 0 or x.device.type != "cpu":
+        return F.dropout(x, p)
+    hits = torch.poisson(torch.tensor(-x.numel() * math.log1p(-p), dtype=torch.float64))
+    scale = x.new_full((x.numel(),), 1 / (1 - p))
+    scale.scatter_(0, torch.randint(max(x.numel(), 1), (int(hits),)), 0)
+    return x * scale.view(x.shape)
+
+
 def repeated(layer: nn.Linear, rows: Sequence[int]) -> Layer:
     """The layer as a function for several inputs in turn, whose numbers of rows are `rows`."""
     product = RepeatedLinear(layer.weight.T.unsqueeze(0), layer.bias.unsqueeze(0), rows)
     return lambda x: product(x.flatten(0, -2).unsqueeze(0)).view(*x.shape[:-1], layer.out_features)
+
+
+class RepeatedLinear:
+    """The layers x @ weight[g] + bias[g], applied to several x one after the other.
+
+    Autograd alone computes the gradient of the weights once per use and adds it to the sum of the
+    previous gradients. For layers of a million weights and a few rows per use, reading and writing
+    these gradients takes as long as the products. Here each use passes on the gradient of its
+    output, and after the last use a single product of all rows gives the gradient of the weights.
+    This is the same sum in another order. It cannot be differentiated again.
+
+    Args:
+        weight: One matrix per group.
+        bias: None for no bias.
+        rows: Number of rows of each x, in the order of use.
+    """
+
+    def __init__(
+        self,
+        weight: Float[Tensor, "groups inputs outputs"],
+        bias: Float[Tensor, "groups outputs"] | None,
+        rows: Sequence[int],
+    ):
+        if torch.is_autocast_enabled(weight.device.type):
+            weight = weight.to(torch.get_autocast_dtype(weight.device.type))
+        if bias is None:
+            bias = weight.new_zeros(len(weight), weight.shape[2])
+        self.weight = weight.detach()
+        self._inputs: list[Tensor] | None = None
+        if torch.is_grad_enabled() and weight.requires_grad:
+            self._inputs = []
+        biases = _Gather.apply(weight, bias.to(weight.dtype), rows, self._inputs)
+        self._biases = iter(biases)
+
+    def __call__(
+        self, x: Float[Tensor, "groups rows inputs"]
+    ) -> Float[Tensor, "groups rows outputs"]:
+        """Apply the layer to the next x."""
+        x = x.to(self.weight.dtype)
+        if self._inputs is not None:
+            self._inputs.append(x.detach())
+        return torch.baddbmm(next(self._biases), x, self.weight)
+
+
+class _Gather(torch.autograd.Function):
+    """The bias, once per use. Its backward pass gets the gradients of all outputs."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, weight: Tensor, bias: Tensor, rows: Sequence[int], inputs: list[Tensor] | None
+    ) -> tuple[Tensor, ...]:
+        ctx.inputs = inputs
+        return tuple(bias.unsqueeze(1).expand(-1, count, -1) for count in rows)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        gradient = torch.cat(upstream[: len(ctx.inputs)], dim=1)  # unused calls are left out
+        weight = gradient.transpose(1, 2) @ torch.cat(ctx.inputs, dim=1)
+        return weight.transpose(1, 2), gradient.sum(dim=1), None, None

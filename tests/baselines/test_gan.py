@@ -135,7 +135,7 @@ def test_choices_are_hard_and_their_gradients_soft(torch_rng):
     weights = torch.randn(2, 3, 5, generator=torch_rng, dtype=torch.float64)
     kept, classes = choices(scenes)
     assert torch.equal(classes.detach().round(), torch.nn.functional.one_hot(labels.argmax(-1), 5))
-    assert torch.equal(kept.detach() > 0.5, kept_objects(complete))
+    assert torch.equal(kept.detach() > 0.5, kept_objects(complete, "first_n"))
     (wanted,) = torch.autograd.grad((labels.softmax(dim=-1) * weights).sum(), labels)
     (got,) = torch.autograd.grad((classes * weights).sum(), labels)
     assert_close(got, wanted, rtol=0, atol=1e-15)

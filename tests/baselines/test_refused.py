@@ -14,8 +14,7 @@ from sceneprior.core.errors import ConfigError, ShardError
 from sceneprior.core.shards import Shard
 from sceneprior.core.views import images_of_split
 from sceneprior.lifted.requests.request import RoomRequest
-from sceneprior.paper.decode import decode_training_rooms
-from sceneprior.paper.sampling import read_latent
+from sceneprior.paper.sampling import decode_training_rooms, read_latent
 from sceneprior.training.fit import fit
 
 CPU = {"accelerator": "cpu", "devices": 1}

@@ -18,9 +18,9 @@ from sceneprior.lifted.losses import latent_loss, lifted_losses, match_lifted, s
 from sceneprior.lifted.reconstruction.objects import answer_images
 from sceneprior.paper.fit_image import FitSchedule, fit_latents_to_images
 from sceneprior.paper.interpolate import interpolate
-from sceneprior.paper.losses import mask_loss
+from sceneprior.paper.losses import layout_losses, mask_loss, seen_masks
+from sceneprior.paper.matching import seen_boxes
 from sceneprior.paper.prior import TrainedPrior
-from sceneprior.paper.view_loss import match_and_score, proxy_boxes, seen_boxes, seen_masks
 
 GOLDEN = FOLDER / "learning.json"
 
@@ -116,13 +116,11 @@ def test_decoded_scenes(paper, lifted):
 def test_losses_of_views(paper, images):
     views = as_views(images, 4)
     scenes = paper.prior.decode(paper.prior.latent_space(paper.logits[:4]), views.is_object)
-    weights, drawing = paper.config.view_terms
-    boxes = seen_boxes(scenes, views, drawing)
-    proxies = {
-        name: proxy_boxes(scenes, views, name).boxes for name in ("ellipsoid", "beveled_box")
-    }
-    losses, matches = match_and_score(scenes, boxes, views, weights, "first_n")
-    masks = seen_masks(scenes.vertices_m, paper.prior.faces, views, drawing)
+    weights, stage = paper.config.loss, paper.config.shape
+    boxes = seen_boxes(scenes, views, stage.proxy, stage.box_from)
+    proxies = {name: seen_boxes(scenes, views, name).boxes for name in ("ellipsoid", "beveled_box")}
+    losses, matches = layout_losses(scenes, boxes, views, weights, "first_n")
+    masks = seen_masks(scenes.vertices_m, paper.prior.faces, views, stage)
     losses["mask"], overlap = mask_loss(masks, views, matches, 0.0)
     check("view_losses", predictions=matches.prediction, **proxies, **losses, **overlap)
 

@@ -16,8 +16,7 @@ from sceneprior.paper.decoders import (
     above_floor,
     fill_unit_box,
 )
-from sceneprior.paper.latents import SphereConfig
-from sceneprior.paper.prior import ScenePrior
+from sceneprior.paper.prior import ScenePrior, SphereConfig
 from sceneprior.paper.transformer import TransformerConfig
 
 

@@ -4,17 +4,14 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from refusals import refused
 
-from sceneprior.paper.decode import decode_latents, decode_rooms
 from sceneprior.paper.interpolate import (
     TILE,
-    RoomPath,
-    even_places,
     interpolate,
     mixed_colors,
     write_pictures,
 )
+from sceneprior.paper.sampling import decode_latents, decode_rooms
 from sceneprior.render.topdown import corner_view, perspective
 
 
@@ -32,12 +29,6 @@ def test_steps_are_even_and_end_where_they_should(trained):
     first = decode_latents(trained, trained.prior.latent_space(trained.logits[:1]), ["step_00"])[0]
     assert len(first.objects) == len(scenes[0].objects) > 0
     np.testing.assert_allclose(first.centers_m, scenes[0].centers_m, atol=1e-5)
-
-
-def test_opposite_ends_are_refused(trained):
-    start = trained.prior.latent_space(trained.logits[:1])[0]
-    with refused("paper/opposite ends"):
-        RoomPath(trained, start, -start).latents(even_places(5))
 
 
 def test_pictures_are_taken_from_one_view(trained, tmp_path, monkeypatch):

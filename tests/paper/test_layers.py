@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from sceneprior.paper.layers import RepeatedLinear, dropout
+from sceneprior.paper.transformer import RepeatedLinear, dropout
 
 
 @pytest.mark.parametrize("p", [0.1, 0.7])

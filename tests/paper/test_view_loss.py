@@ -11,8 +11,7 @@ from toy_rooms import look_at
 
 from sceneprior.core.cameras import boxes_of_points
 from sceneprior.core.views import DecodedScenes, SceneViews
-from sceneprior.paper.settings import ShapeConfig
-from sceneprior.paper.view_loss import proxy_boxes, seen_boxes
+from sceneprior.paper.matching import seen_boxes
 
 
 @pytest.fixture
@@ -49,9 +48,9 @@ def test_the_shape_stage_takes_boxes_from_where_it_is_told(seen, tmp_path, box_f
     config = tiny_config(tmp_path, shape__box_from=box_from, shape__proxy="ellipsoid")
     prior = config.build_prior()
     scenes = prior(config.build_latents(2).weight)
-    found = seen_boxes(scenes, seen[1], config.shape)
+    found = seen_boxes(scenes, seen[1], config.shape.proxy, config.shape.box_from)
     if box_from == "proxy":
-        expected = proxy_boxes(scenes, seen[1], "ellipsoid")
+        expected = seen_boxes(scenes, seen[1], "ellipsoid")
     else:
         views = seen[1]
         expected = boxes_of_points(
@@ -74,8 +73,7 @@ def test_predictions_that_are_matched_to_nothing_are_not_projected(seen, box_fro
         sides_clear=views.sides_clear[:, :, :2],
     )  # fmt: skip
     for proxy in ("ellipsoid", "beveled_box"):
-        settings = ShapeConfig(epochs=1, box_from=box_from, proxy=proxy)
-        some, every = seen_boxes(scenes, fewer, settings), seen_boxes(scenes, views, settings)
+        some, every = (seen_boxes(scenes, of, proxy, box_from) for of in (fewer, views))
         for found, wanted in zip(some, every, strict=True):
             # The same operations on other strides: the last bits may differ.
             assert_close(found[0, :, :2], wanted[0, :, :2])

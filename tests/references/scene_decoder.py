@@ -6,7 +6,7 @@ import math
 import torch
 from torch.nn import functional as F
 
-from sceneprior.paper.layers import dropout
+from sceneprior.paper.transformer import dropout
 
 
 def unroll(model, z, objects):
@@ -14,10 +14,9 @@ def unroll(model, z, objects):
 
     Each step uses `torch.nn`'s layers, so autograd adds up the gradients of their weights.
     """
-    query = model._query(z)
+    query, key_query = model.queries(z)
     tokens = model.start.expand(len(z), 1, -1)
     qkv = _split(model, model.encoder_qkv(tokens))
-    key_query = model._key_query(query)
     features = []
     for _ in range(objects):
         if features:
@@ -31,10 +30,9 @@ def unroll(model, z, objects):
 
 def next_object(model, z, previous):
     """The feature that a SceneTransformer says follows a set of objects, in whatever order."""
-    query = model._query(z)
     tokens = torch.cat([model.start.expand(len(z), 1, -1), previous], dim=1)
     qkv = _split(model, model.encoder_qkv(tokens))
-    return _next(model, query, model._key_query(query), tokens, qkv)
+    return _next(model, *model.queries(z), tokens, qkv)
 
 
 def _next(model, z_query, key_query, tokens, qkv):
@@ -50,7 +48,7 @@ def _next(model, z_query, key_query, tokens, qkv):
     mixed = torch.baddbmm(bias, summed, value).transpose(0, 1).flatten(1)
     x = model.decoder_norm(z_query + _drop(model, model.decoder_out(mixed)))
     x = model.decoder_end(_feed_forward(model.decoder_ff, x))
-    return x if model.output is None else model.output(x, step=tokens.shape[1] - 1)
+    return x if model.output is None else model.output.mlps[tokens.shape[1] - 1](x)
 
 
 def _feed_forward(layer, x):

@@ -27,7 +27,7 @@ def watched(monkeypatch) -> list[tuple]:
         scenes, boxes = args[:2]
         return [scenes.class_logits, scenes.centers_m, scenes.sizes_m, boxes.boxes]
 
-    watch(stages, "match_and_score", predicted)
+    watch(stages, "layout_losses", predicted)
     watch(stages, "seen_masks", lambda args: args[:1])
     return seen
 
@@ -37,7 +37,7 @@ def test_bfloat16_stops_at_the_network(toy_shards, tmp_path, watched):
     full = record(config, tmp_path / "full", 1)
     watched.clear()
     mixed = record(config, tmp_path / "mixed", 1, precision="bf16-mixed")
-    assert {name for name, _, _ in watched} == {"match_and_score", "seen_masks"}
+    assert {name for name, _, _ in watched} == {"layout_losses", "seen_masks"}
     for _, types, autocast in watched:
         assert set(types) == {torch.float32} and not autocast
     one, other = (

@@ -16,8 +16,7 @@ from sceneprior.apps.experiments.evaluate import (
 )
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.lifted.lifting import dataset as lifted
-from sceneprior.paper.decode import decode_training_rooms
-from sceneprior.paper.sampling import DISTRIBUTIONS
+from sceneprior.paper.sampling import DISTRIBUTIONS, decode_training_rooms
 from sceneprior.training.checkpoints import read_checkpoint
 from sceneprior.training.fit import fit
 

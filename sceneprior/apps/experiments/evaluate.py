@@ -25,9 +25,8 @@ from sceneprior.evaluation.report import ROOMS_SHOWN, write_report
 from sceneprior.evaluation.room_sets import seeded_rows
 from sceneprior.evaluation.synthesis import FORMAT, EvalOptions, evaluate_synthesis
 from sceneprior.evaluation.use import UseOptions, evaluate_use
-from sceneprior.paper.decode import decode_latents, decode_training_rooms
 from sceneprior.paper.prior import TrainedPrior
-from sceneprior.paper.sampling import marked
+from sceneprior.paper.sampling import decode_latents, decode_training_rooms, marked
 from sceneprior.render.scene_files import load_scene_folder
 from sceneprior.training.method import Trained, TrainedSampler
 
@@ -240,11 +239,10 @@ def unfold(trained: TrainedPrior) -> list[Scene]:
     """Rooms along the geodesic between two distant training rooms, from one latent to the other."""
     space = trained.prior.latent_space
     z = space(trained.logits)
-    end = int(space.nearness(z[:1], z).argmin())
-    start, far = z[:1].expand(UNFOLDING_STEPS, -1), z[end].expand(UNFOLDING_STEPS, -1)
+    far = z[(z - z[0]).norm(dim=-1).argmax()]
     names = [f"step_{step}" for step in range(UNFOLDING_STEPS)]
     along = torch.linspace(0, 1, UNFOLDING_STEPS)
-    return decode_latents(trained, space.between(start, far, along), names)
+    return decode_latents(trained, space.between(z[0], far, along), names)
 
 
 def read_curves(run: Path) -> dict[str, list[tuple[int, float]]]:

@@ -15,9 +15,9 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.views import ObservedImage, SceneViews, as_views, rows_of
 from sceneprior.lifted.reconstruction.objects import answer_images
-from sceneprior.paper.decode import scene_of
 from sceneprior.paper.fit_image import SCHEDULES, fit_latents_to_images, refuse_crowds, view_loss
-from sceneprior.paper.prior import TrainedPrior, with_training_latents
+from sceneprior.paper.prior import TrainedPrior
+from sceneprior.paper.sampling import scene_of, with_training_latents
 from sceneprior.training.method import Trained, TrainedReconstructor
 
 BATCH = 128

@@ -18,10 +18,15 @@ from sceneprior.core.scene import Scene
 from sceneprior.evaluation.metrics.contents import common_label_set
 from sceneprior.evaluation.metrics.novelty import nearest_room
 from sceneprior.lifted.config import SAMPLER, TrainedLifted
-from sceneprior.paper.decode import decode_latents, to_rooms
 from sceneprior.paper.interpolate import RoomPath, even_places
-from sceneprior.paper.prior import TrainedPrior, with_training_latents
-from sceneprior.paper.sampling import DISTRIBUTIONS, named_latent
+from sceneprior.paper.prior import TrainedPrior
+from sceneprior.paper.sampling import (
+    DISTRIBUTIONS,
+    decode_latents,
+    named_latent,
+    to_rooms,
+    with_training_latents,
+)
 
 SOME = 64
 """Most training rooms from which the size of rooms is estimated."""

@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from sceneprior.core.errors import InputError
-from sceneprior.paper.latents import LatentSpace, LatentSphere
+from sceneprior.paper.prior import LatentSpace, LatentSphere
 
 MARGIN = 0.12
 """Margin around the outermost training rooms, as a share of the map's side."""

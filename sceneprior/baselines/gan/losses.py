@@ -16,7 +16,7 @@ from sceneprior.core.cameras import camera_centers
 from sceneprior.core.classes import VOID
 from sceneprior.core.errors import InputError
 from sceneprior.core.views import DecodedScenes, SceneViews
-from sceneprior.paper.layers import mlp
+from sceneprior.paper.decoders import mlp
 
 SLOPE = 0.2
 """Slope of the leaky ReLUs."""

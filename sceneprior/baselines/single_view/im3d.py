@@ -44,7 +44,7 @@ from sceneprior.baselines.single_view.truth import CELLS, TrueViews
 from sceneprior.core.boxes import turn_vectors
 from sceneprior.core.scene import Mesh
 from sceneprior.core.surfaces import surface_of
-from sceneprior.paper.layers import mlp
+from sceneprior.paper.decoders import mlp
 from sceneprior.training.steps import full_precision
 
 STEEP, LEVEL = 10.0, 0.5

@@ -24,7 +24,7 @@ from sceneprior.core.dataset import ViewDataset
 from sceneprior.core.scene import Mesh
 from sceneprior.core.settings import Section
 from sceneprior.core.views import SceneViews
-from sceneprior.paper.layers import mlp
+from sceneprior.paper.decoders import mlp
 from sceneprior.training.method import FoundObject, TrainedReconstructor, ViewDataConfig, ready_copy
 
 

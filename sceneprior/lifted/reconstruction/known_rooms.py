@@ -24,13 +24,13 @@ from sceneprior.core.ground_truth import reference_scene
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.core.shards import Shard, iterate_rooms
 from sceneprior.core.views import DecodedScenes, ObservedImage, as_views, rows_of
-from sceneprior.paper.matching import match_objects, matching_cost
+from sceneprior.paper.matching import assign, matching_cost
 from sceneprior.render.appearance import scene_meshes
 from sceneprior.render.offscreen import Renderer
 
 BOX_WEIGHT, OCCLUSION_SLACK = 5.0, 0.15
 """Weight and occlusion slack of the cost by which a room's objects are matched to masks
-(`match_objects`). The slack is below 1 since boxes of whole objects extend behind occluders."""
+(`matching_cost`). The slack is below 1 since boxes of whole objects extend behind occluders."""
 SHORTLIST = 16
 """Number of rooms, the best by class and 2D box, whose masks are compared."""
 MASK_COLUMNS = 80
@@ -172,10 +172,10 @@ def _matched(
     decoded = DecodedScenes(logits, centers_m, sizes_m, torch.zeros(centers_m.shape[:2]))
     corners = box_corners(centers_m, sizes_m)
     boxes = boxes_of_points(corners, view.world_to_camera, view.intrinsics, view.image_size)
-    settings = (BOX_WEIGHT, OCCLUSION_SLACK)
-    chosen = match_objects(decoded, boxes, view, *settings, first_n=False).prediction
-    costs = matching_cost(decoded, boxes, view, *settings).gather(1, chosen.unsqueeze(1))
-    return chosen.tolist(), costs[:, 0].mean(dim=1)
+    costs = matching_cost(decoded, boxes, view, BOX_WEIGHT, OCCLUSION_SLACK)
+    slots = [costs.shape[1]] * len(rows)  # the objects have no order, so all of them take part
+    chosen = assign(costs, slots, view.is_object.sum(dim=-1).tolist())
+    return chosen.tolist(), costs.gather(1, chosen.unsqueeze(1))[:, 0].mean(dim=1)
 
 
 def mask_overlap(answer: KnownAnswer, image: ObservedImage, renderer: Renderer) -> float:

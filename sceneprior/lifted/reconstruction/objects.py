@@ -23,9 +23,9 @@ from sceneprior.lifted.prototype_decoder import PrototypeDecoder
 from sceneprior.lifted.reconstruction.known_rooms import turn_object
 from sceneprior.lifted.reconstruction.placing import Outlines, Placed, outlines_of, place_objects
 from sceneprior.lifted.rooms import PosedScenes
-from sceneprior.paper.decode import scene_of
 from sceneprior.paper.losses import kept_objects
 from sceneprior.paper.prior import ScenePrior, TrainedPrior
+from sceneprior.paper.sampling import scene_of
 
 OF_CLASS = 200
 """Number of candidates per class, chosen with a fixed seed."""

@@ -16,7 +16,7 @@ from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.contents import Contents, PairwisePotentials
 from sceneprior.lifted.sampler.frames import SYMMETRIES, gaps_m, rectangle_sides
 from sceneprior.lifted.sampler.placement import SHOWN, Placement, Places
-from sceneprior.paper.layers import mlp
+from sceneprior.paper.decoders import mlp
 from sceneprior.training.method import TrainConfig
 
 CLASS_WIDTH = 32

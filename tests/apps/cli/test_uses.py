@@ -20,7 +20,7 @@ from sceneprior.apps.priors.packed import shipped_priors
 from sceneprior.apps.rooms import write_scenes
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.interchange.export import FORMATS
-from sceneprior.paper import decode
+from sceneprior.paper import sampling
 
 BEDROOM = "front3d_bedroom"
 
@@ -78,8 +78,8 @@ def test_synthesize_writes_walls_if_asked(command, toy_run, tmp_path):
 def test_empty_rooms_are_written_and_named(command, toy_run, monkeypatch, furnished, note):
     drawn = torch.zeros(7, 1, dtype=torch.bool)
     drawn[furnished] = True
-    kept = decode.kept_objects
-    monkeypatch.setattr(decode, "kept_objects", lambda *given: kept(*given) & drawn)
+    kept = sampling.kept_objects
+    monkeypatch.setattr(sampling, "kept_objects", lambda *given: kept(*given) & drawn)
     status, out, errors = command("synthesize", "--run", toy_run, "-n", 7, "--out", "some")
     assert (status, out) == (0, "Wrote 7 rooms to some (from: paper)\n")
     last = errors.strip().splitlines()[-1]

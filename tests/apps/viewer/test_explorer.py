@@ -15,9 +15,8 @@ from sceneprior.apps.viewer.explorer import PATH_STEPS, Explorer, Folder, Shown,
 from sceneprior.apps.viewer.latent_map import SNAP, make_map
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene, SceneObject
-from sceneprior.paper.decode import decode_training_rooms
-from sceneprior.paper.latents import LatentCube, LatentSphere
-from sceneprior.paper.sampling import LATENTS_FILE, write_latents
+from sceneprior.paper.prior import LatentCube, LatentSphere
+from sceneprior.paper.sampling import LATENTS_FILE, decode_training_rooms, write_latents
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from sceneprior.apps.viewer.latent_map import make_map
 from sceneprior.apps.viewer.scene_nodes import Board, Display, RoomNodes
 from sceneprior.core.scene import Mesh, Opening, Scene, SceneObject
 from sceneprior.core.shell import shell_of
-from sceneprior.paper.latents import LatentCube
+from sceneprior.paper.prior import LatentCube
 
 BED = SceneObject("double_bed", (0.0, 0.5, 0.0), (2.0, 1.0, 2.0))
 LAMP = SceneObject("pendant_lamp", (1.0, 2.0, 0.0), (0.4, 0.6, 0.4))

@@ -45,7 +45,7 @@ def test_rooms_come_from_the_sampler_and_others_if_asked(sampler_run, few_attemp
     made = sample_rooms(trained, 3, 5)
     assert [scene.latent for scene in made] == [None] * 3 and made[0].name == "seed5_0000"
     assert all(item.mesh is not None for room in made for item in room.objects)
-    z, _ = draw_latents(trained, 3, 5, "paper")
+    z = draw_latents(trained, 3, 5, "paper")
     latents = [scene.latent for scene in sample_rooms(trained, 3, 5, "paper")]
     np.testing.assert_array_equal(np.stack(latents), z)
     early = replace(trained, sampler=None, stage="shape")

@@ -21,21 +21,18 @@ from sceneprior.paper.losses import (
     layout_losses,
     take,
 )
-from sceneprior.paper.matching import Matches, match_objects
+from sceneprior.paper.matching import match_objects
 from sceneprior.paper.prior import ModelConfig
+from sceneprior.paper.settings import LossConfig
 
 OVERSHOOT = (1.0, 0.3)
-
-
-def matched(batch, overshoot=1.0) -> Matches:
-    return match_objects(batch.scenes, batch.boxes, batch.views, 5.0, overshoot)
 
 
 @pytest.mark.parametrize("overshoot", OVERSHOOT)
 def test_all_four_terms_are_their_loops(batch, overshoot):
     views, scenes = batch.views, batch.scenes
-    matches = matched(batch, overshoot)
-    losses = layout_losses(scenes, batch.boxes, views, matches, overshoot)
+    weights = LossConfig(occlusion_slack=overshoot)
+    losses, matches = layout_losses(scenes, batch.boxes, views, weights, "first_n")
     slot = matches.prediction.tolist()
     valid = matches.valid.tolist()
     visible, inside = views.visible.tolist(), batch.boxes.in_frustum.tolist()
@@ -84,8 +81,7 @@ def test_nothing_seen_is_zero_loss_not_nan(batch):
     none = torch.zeros_like(batch.views.visible)
     views = replace(batch.views, visible=none)
     scenes = replace(batch.scenes, centers_m=batch.scenes.centers_m.clone().requires_grad_())
-    matches = match_objects(scenes, batch.boxes, views)
-    losses = layout_losses(scenes, batch.boxes, views, matches)
+    losses, _ = layout_losses(scenes, batch.boxes, views, LossConfig(), "first_n")
     assert losses["class"] == losses["box"] == losses["frustum"] == 0
     losses["frustum"].backward()
     assert (scenes.centers_m.grad == 0).all()
@@ -93,7 +89,8 @@ def test_nothing_seen_is_zero_loss_not_nan(batch):
 
 def test_every_layout_term_passes_gradcheck(batch):
     """With the matches held fixed, as in a training step."""
-    views, matches = batch.views, matched(batch)
+    views = batch.views
+    matches = match_objects(batch.scenes, batch.boxes, views)
     seen = views.visible & matches.valid[:, None]
 
     def boxes(centers, sizes):
@@ -113,7 +110,9 @@ def test_every_layout_term_passes_gradcheck(batch):
         return class_loss(replace(batch.scenes, class_logits=logits), views.object_class, matches)
 
     def completeness(logits):
-        return completeness_loss(replace(batch.scenes, completeness_logits=logits), views)
+        return completeness_loss(
+            replace(batch.scenes, completeness_logits=logits), views, "first_n"
+        )
 
     scenes = batch.scenes
     for term, inputs in (
@@ -133,7 +132,7 @@ CONVENTIONS = ModelConfig.model_fields["completeness_target"].annotation.__args_
 
 def test_the_two_conventions_written_out():
     counts = torch.tensor([1, 3, 5])
-    assert completeness_targets(counts, 5).int().tolist() == [
+    assert completeness_targets(counts, 5, "first_n").int().tolist() == [
         [1, 0, 0, 0, 0], [1, 1, 1, 0, 0], [1, 1, 1, 1, 1],
     ]  # fmt: skip
     assert completeness_targets(counts, 5, "stop").int().tolist() == [
@@ -150,7 +149,11 @@ def test_scores_that_say_what_they_should_keep_the_real_objects(convention):
 
 def test_the_first_word_counts():
     logits = torch.tensor([[2.0, 0.1, -0.1, 5.0], [-1, -2, 3, -1], [-1, -1, -1, -1]])
-    assert kept_objects(logits).int().tolist() == [[1, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]
+    assert kept_objects(logits, "first_n").int().tolist() == [
+        [1, 1, 0, 0],
+        [0, 0, 0, 0],
+        [0, 0, 0, 0],
+    ]
     # Nobody says stop in the last room: it is as large as rooms can be.
     assert kept_objects(logits, "stop").int().tolist() == [[1, 0, 0, 0], [1, 1, 1, 0], [1, 1, 1, 1]]
 

@@ -10,7 +10,8 @@ from torch.testing import assert_close
 
 from sceneprior.core.cameras import Boxes2D
 from sceneprior.paper.losses import layout_losses, mask_loss, mean_of_objects
-from sceneprior.paper.matching import Matches, match_objects
+from sceneprior.paper.matching import match_objects
+from sceneprior.paper.settings import LossConfig
 
 
 def masks(batch, seed=0, sharp=1.0):
@@ -105,16 +106,12 @@ def only(thing, room: int):
 
 
 def test_layout_terms(batch):
-    matches = match_objects(batch.scenes, batch.boxes, batch.views)
-    found = layout_losses(batch.scenes, batch.boxes, batch.views, matches, 0.3, None)
+    weights = LossConfig(occlusion_slack=0.3)
+    found, _ = layout_losses(batch.scenes, batch.boxes, batch.views, weights, None)
     for room in range(3):
-        alone = layout_losses(
-            only(batch.scenes, room),
-            Boxes2D(*(part[room : room + 1] for part in batch.boxes)),
-            only(batch.views, room),
-            Matches(*(part[room : room + 1] for part in matches)),
-            0.3,
-        )
+        boxes = Boxes2D(*(part[room : room + 1] for part in batch.boxes))
+        one = (only(batch.scenes, room), boxes, only(batch.views, room))
+        alone, _ = layout_losses(*one, weights, "first_n")
         assert alone.keys() - {"completeness"} == found.keys()
         for name, value in found.items():
             assert value.shape == (3,)
