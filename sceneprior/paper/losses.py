@@ -18,7 +18,6 @@ from sceneprior.core.cameras import Boxes2D, camera_centers, pixel_rays
 from sceneprior.core.views import DecodedScenes, SceneViews
 from sceneprior.paper.matching import Matches, first_predictions, match_objects, side_distance
 from sceneprior.paper.settings import LossConfig, ShapeConfig
-from sceneprior.render.silhouettes.render import render_silhouettes
 from sceneprior.training.steps import check_finite, weighted_sum
 
 CERTAIN = 1e-6
@@ -152,6 +151,8 @@ def seen_masks(
     In a room of n objects, only the first n predictions, which are matched, are rendered; the
     others would occlude them.
     """
+    from sceneprior.render.silhouettes.render import render_silhouettes  # not for new rooms
+
     height, width = views.observed_ids.shape[-2:]
     return render_silhouettes(
         vertices_m,
