@@ -252,7 +252,7 @@ def composite(
     order_m: Float[Tensor, "images objects height width"],
     compositing: str,
 ) -> Float[Tensor, "images objects height width"]:
-    """Visible soft masks from coverages and depths; see `cpu.compositing`."""
+    """Visible soft masks from coverages and depths; see `cpu.backend`."""
     if compositing == "alone" or coverage.shape[1] == 0:
         return coverage
     sequence = order_m.argsort(dim=1, stable=True)

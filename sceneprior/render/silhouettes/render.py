@@ -82,7 +82,7 @@ def render_scene(
             1) * sigma, at which the sigmoid is 1e-4.
         mode: `exact` or `fast`.
         compositing: Treatment of occlusion. `layered` (alpha compositing) and `paper` give visible
-            masks, see `cpu/compositing.py`. `alone` draws each object as if there were no others.
+            masks, see `cpu/backend.py`. `alone` draws each object as if there were no others.
         drawn: True for the objects to draw; the others get empty masks and occlude nothing. None
             draws all objects.
         backend: `cpu` (Numba), `cuda` (Triton), `reference` (plain torch), or `auto`: `cpu` or

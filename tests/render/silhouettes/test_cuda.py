@@ -86,7 +86,7 @@ def test_without_triton_the_import_says_what_to_do(monkeypatch):
 
 
 def test_edges_are_read_again_only_where_faces_were_written_to():
-    from sceneprior.render.silhouettes.cuda.outline import edges_of
+    from sceneprior.render.silhouettes.cuda.kernels import edges_of
 
     faces = torch.tensor([[0, 1, 2], [2, 1, 3]])
     edges = edges_of(faces)

@@ -3,10 +3,10 @@
 Without a GPU, the kernels run on CPU tensors through Triton's interpreter (TRITON_INTERPRET=1
 before Triton is first imported): correctly, but too slowly for anything but tests.
 
-    windows      tiles of the image that each mesh may touch
-    faces        exact mode: coverage and depth order in the windows, and the gradient
-    outline      fast mode: coverage and depth order in the windows, and the gradient
-    here         windows to images, and the gradient
+    kernels  tiles of the image that each mesh may touch
+    faces    exact mode: coverage and depth order in the windows, and the gradient
+    outline  fast mode: coverage and depth order in the windows, and the gradient
+    here     windows to images, and the gradient
 
 For the composition there is one program per image tile. Few objects meet in a tile, so all pairs
 are compared instead of sorting. `missed` and `order` are the outputs of `cover_tiles` or
@@ -18,13 +18,19 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sceneprior.render.silhouettes.cuda import backend, faces, kernels, outline
-from sceneprior.render.silhouettes.cuda.kernels import TILE, holds, packed_at, tl, triton
-from sceneprior.render.silhouettes.cuda.windows import (
+from sceneprior.render.silhouettes.cuda import faces, outline
+from sceneprior.render.silhouettes.cuda.kernels import (
+    EMPTY,
     INTERPRETED,
+    TILE,
+    edges_of,
     find_windows,
+    holds,
     launch,
+    packed_at,
     tiles_across,
+    tl,
+    triton,
 )
 from sceneprior.render.silhouettes.reference import Drawing, Settings
 
@@ -184,10 +190,10 @@ def draw(
             f"the backend `cuda` needs tensors on a CUDA device, but these are on "
             f"'{pixels.device}'; move them there or choose another backend"
         )
-    if max(settings.image_size) > kernels.EMPTY.value:
+    if max(settings.image_size) > EMPTY.value:
         raise ValueError(
             f"image_size is {settings.image_size}; the backend `cuda` draws sides of at most "
-            f"{kernels.EMPTY.value} pixels"
+            f"{EMPTY.value} pixels"
         )
     return Drawing(*_Draw.apply(pixels, depths, triangles, drawn, settings))
 
@@ -198,7 +204,7 @@ class _Draw(torch.autograd.Function):
         images, objects = depths.shape[:2]
         height, width = settings.image_size
         pixels, depths = pixels.contiguous(), depths.contiguous()
-        edges = outline.edges_of(triangles) if settings.mode == "fast" else None
+        edges = edges_of(triangles) if settings.mode == "fast" else None
         triangles = triangles.to(torch.int32).contiguous()
         windows = find_windows(pixels, depths, triangles, drawn, settings)
         meshes = (pixels, depths, triangles, windows, settings)
@@ -209,7 +215,7 @@ class _Draw(torch.autograd.Function):
         front = torch.empty(images, height, width, dtype=torch.int32, device=pixels.device)
         depth = pixels.new_empty(images, height, width)
         launch(
-            backend.composite_tiles, images * tiles_across(height) * tiles_across(width),
+            composite_tiles, images * tiles_across(height) * tiles_across(width),
             missed, order, windows.places, windows.first_tiles, masks, front, depth, objects,
             height, width, MODE=settings.compositing, num_warps=1,
         )  # fmt: skip
@@ -230,7 +236,7 @@ class _Draw(torch.autograd.Function):
         upstream = upstream.contiguous()
         packed = torch.empty_like(missed)
         launch(
-            backend.composite_backward, images * tiles_across(height) * tiles_across(width),
+            composite_backward, images * tiles_across(height) * tiles_across(width),
             missed, order, places, first_tiles, upstream if masks is None else masks, upstream,
             packed, objects, height, width, MODE=ctx.settings.compositing, num_warps=1,
         )  # fmt: skip

@@ -1,4 +1,4 @@
-"""The exact mode on CUDA: coverage of each mesh (kernel in kernels.py), and its gradient.
+"""The exact mode on CUDA: coverage of each mesh, and its gradient.
 
 The backward pass has two kernels: one sums the gradients of each face's corners over the pixels of
 the face, the other adds them up by vertex. The order of each sum is fixed.
@@ -9,15 +9,21 @@ from torch import Tensor
 
 from sceneprior.render.silhouettes.cuda.kernels import (
     BLOCK,
+    SLACK,
     TILE,
+    Edges,
+    Windows,
+    are_drawn,
     corners_of,
-    cover_tiles,
+    first_bit,
+    hits,
+    launch,
+    tile_pixels,
     tl,
     to_edge,
     triton,
     window,
 )
-from sceneprior.render.silhouettes.cuda.windows import Windows, launch
 from sceneprior.render.silhouettes.reference import Settings
 
 FACES, PIXELS = 8, 8
@@ -26,6 +32,71 @@ FACES, PIXELS = 8, 8
 
 VERTICES = 128
 """Vertices per program of `gather_vertices`."""
+
+
+@triton.jit
+def cover_tiles(
+    pixels, inverse_depths, faces, face_bounds, block_bounds, windows, first_tiles, tile_meshes,
+    missed, order, vertex_count, block_count, sigma, blur,
+):  # pragma: no cover - compiled  # fmt: skip
+    """Draw one mesh in one tile: 1 - coverage, and the order value, in the exact mode.
+
+    The order value is the depth at pixels whose centre lies in a face, the negative depth in the
+    halo (the blur outside the faces), and minus infinity elsewhere.
+    """
+    mesh, top_row, left_column, row, column, at = tile_pixels(windows, first_tiles, tile_meshes)
+    real = missed.dtype.element_ty
+    px, py = column.to(real) + 0.5, row.to(real) + 0.5
+    # odds = prod_f (1 + e^x_f). If it overflows to infinity, missed = 1 / odds is 0.
+    odds = tl.full((TILE * TILE,), 1, real)
+    inverse_inside = tl.zeros((TILE * TILE,), real)  # 1 / depth; 0 is infinitely far
+    inverse_halo = tl.zeros((TILE * TILE,), real)
+    inverse_sigma = 1.0 / sigma
+    row_size = block_count * BLOCK
+    block_bounds += mesh * 4 * block_count
+    face_bounds += mesh * 4 * row_size
+    for group in range(0, block_count, BLOCK):
+        blocks = hits(block_bounds, group, block_count, block_count, top_row, left_column)
+        while blocks != 0:
+            first = (group + first_bit(blocks)) * BLOCK
+            blocks &= blocks - 1
+            found = hits(face_bounds, first, row_size, row_size, top_row, left_column)
+            while found != 0:
+                face = first + first_bit(found)
+                found &= found - 1
+                a, b, c, ax, ay, bx, by, cx, cy = corners_of(
+                    pixels, faces, face, mesh * vertex_count, True, real
+                )
+                ia, ib = tl.load(inverse_depths + a), tl.load(inverse_depths + b)
+                ic = tl.load(inverse_depths + c)
+                rx, ry, _, wc = to_edge(px, py, ax, ay, bx, by)
+                distance = rx * rx + ry * ry
+                rx, ry, _, wa = to_edge(px, py, bx, by, cx, cy)
+                distance = tl.minimum(distance, rx * rx + ry * ry)
+                rx, ry, _, wb = to_edge(px, py, cx, cy, ax, ay)
+                distance = tl.minimum(distance, rx * rx + ry * ry)
+                area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+                turn = tl.where(area > 0, 1.0, -1.0)
+                wa, wb, wc = wa * turn, wb * turn, wc * turn
+                least = tl.minimum(tl.minimum(wa, wb), wc)
+                inside = least > 0
+                contained = least + SLACK * tl.abs(area) > 0
+                halo = (distance < blur) & (inside == 0)
+                x = tl.minimum(tl.where(inside, distance, -distance) * inverse_sigma, 80.0)
+                odds *= tl.where(inside | halo, 1.0 + tl.exp(x), 1.0)
+                wa, wb, wc = tl.maximum(wa, 0.0), tl.maximum(wb, 0.0), tl.maximum(wc, 0.0)
+                total = wa + wb + wc
+                # Far from a sliver, all weights may round to 0; then the nearest corner is used.
+                inverse = tl.where(
+                    total > 0,
+                    (wa * ia + wb * ib + wc * ic) / tl.where(total > 0, total, 1.0),
+                    tl.maximum(tl.maximum(ia, ib), ic),
+                )
+                inverse_inside = tl.maximum(inverse_inside, tl.where(contained, inverse, 0.0))
+                inverse_halo = tl.maximum(inverse_halo, tl.where(halo, inverse, 0.0))
+    tl.store(missed + at, 1.0 / odds)
+    value = tl.where(inverse_inside > 0, 1.0 / inverse_inside, -1.0 / inverse_halo)
+    tl.store(order + at, value)
 
 
 @triton.jit
@@ -190,3 +261,56 @@ def sum_by_vertex(by_corner: Tensor, owners: Tensor, places: Tensor, pixels: Ten
         VERTICES=VERTICES, num_warps=4,
     )  # fmt: skip
     return gradient
+
+
+EDGES = tl.constexpr(128)
+"""Edges per program of `sum_layers`."""
+
+
+@triton.jit
+def sum_layers(
+    pixels, depths, faces, windows, first_faces, edge_faces, edge_ways, layers,
+    vertex_count, edge_count, near,
+):  # pragma: no cover - compiled  # fmt: skip
+    """Number of faces to the left of each edge in the image, minus those to its right."""
+    programs = tl.cdiv(edge_count, EDGES)
+    mesh = tl.program_id(0).to(tl.int64) // programs
+    edge = (tl.program_id(0) % programs) * EDGES + tl.arange(0, EDGES)
+    exists = edge < edge_count
+    first = tl.load(first_faces + edge, mask=exists, other=0)
+    count = tl.load(first_faces + edge + 1, mask=exists, other=0) - first
+    seen = tl.load(windows + mesh * 4 + 2) > 0
+    most = tl.where(seen, tl.max(count, axis=0), 0)
+    total = tl.zeros((EDGES,), tl.int32)
+    for step in range(0, most):
+        here = step < count
+        face = tl.load(edge_faces + first + step, mask=here, other=0)
+        way = tl.load(edge_ways + first + step, mask=here, other=0)
+        a, b, c, ax, ay, bx, by, cx, cy = corners_of(
+            pixels, faces, face, mesh * vertex_count, here, tl.float64
+        )
+        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+        keep = are_drawn(depths, a, b, c, area, here, near)
+        total += tl.where(keep, tl.where(area > 0, way, -way), 0)
+    tl.store(layers + mesh * edge_count + edge, total, mask=exists)
+
+
+def layers_of(
+    pixels: Tensor,
+    depths: Tensor,
+    faces: Tensor,
+    windows: Windows,
+    settings: Settings,
+    edges: Edges,
+) -> Tensor:
+    """(meshes, edges) int32: the faces to the left of each edge in the image, minus those to its
+    right."""
+    meshes, vertices = len(windows.places), pixels.shape[2]
+    layers = torch.empty(meshes, len(edges.ends), dtype=torch.int32, device=pixels.device)
+    programs = meshes * -(-len(edges.ends) // EDGES.value)
+    launch(
+        sum_layers, programs, pixels, depths, faces, windows.places,
+        edges.first_faces, edges.faces, edges.ways, layers, vertices, len(edges.ends),
+        settings.near_m, num_warps=4, enable_fp_fusion=False,
+    )  # fmt: skip
+    return layers

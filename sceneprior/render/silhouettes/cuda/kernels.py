@@ -1,24 +1,30 @@
-"""Shared helpers of the Triton kernels, and the exact mode's coverage kernel.
+"""Shared helpers of the Triton kernels, their launch, and the windows of the meshes.
 
 A mesh is one object in one image. Its window is the part of the image that its faces may touch, in
 whole tiles of TILE x TILE pixels. Windows are packed one after the other, row by row, so memory
 grows with the covered pixels. No two programs add to the same address, so results are
 deterministic. `missed` is 1 - coverage, the probability that the mesh misses the pixel.
 
-    windows          bound_faces         per mesh          pixels that faces touch, and the window
-    kernels          cover_tiles         per packed tile   missed, order value
-    faces            corner_gradients    per few faces     gradient of each face's corners
-                     gather_vertices     per few vertices  gradient of each vertex
-    outline_kernels  sum_layers          per few edges     change in the number of faces
-                     certify_pieces      per few pieces    pieces without a face beyond them
-                     trace_tiles         per packed tile   missed, order value, nearest piece
-                     end_gradients       per few pieces    gradient of the edge's ends
-    backend          composite_tiles     per image tile    masks, front, depth
-                     composite_backward  per image tile    gradient of packed pixels
+    kernels  bound_faces         per mesh          pixels that faces touch, and the window
+    faces    cover_tiles         per packed tile   missed, order value
+             corner_gradients    per few faces     gradient of each face's corners
+             gather_vertices     per few vertices  gradient of each vertex
+             sum_layers          per few edges     change in the number of faces
+    outline  certify_pieces      per few pieces    pieces without a face beyond them
+             trace_tiles         per packed tile   missed, order value, nearest piece
+             end_gradients       per few pieces    gradient of the edge's ends
+    backend  composite_tiles     per image tile    masks, front, depth
+             composite_backward  per image tile    gradient of packed pixels
 
-`cover_tiles` and `faces` implement the exact mode, `outline_kernels` the fast mode. Block shapes
-are chosen for an H200 by counting instructions and registers, not yet by measurement.
+`faces` implements the exact mode, `outline` the fast mode. Block shapes are chosen for an H200 by
+counting instructions and registers, not yet by measurement.
 """
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.utils.weak import WeakTensorKeyDictionary
 
 try:
     import triton
@@ -31,6 +37,7 @@ except ImportError as error:
     ) from error
 
 from sceneprior.render.silhouettes import reference
+from sceneprior.render.silhouettes.reference import Settings, topology_of
 
 TILE = tl.constexpr(8)
 """Side of a tile in pixels; its 64 pixels are 2 for each lane of a warp."""
@@ -149,66 +156,170 @@ def to_edge(px, py, ax, ay, bx, by):  # pragma: no cover - compiled
     return qx - t * ex, qy - t * ey, t, ex * qy - ey * qx
 
 
-@triton.jit
-def cover_tiles(
-    pixels, inverse_depths, faces, face_bounds, block_bounds, windows, first_tiles, tile_meshes,
-    missed, order, vertex_count, block_count, sigma, blur,
-):  # pragma: no cover - compiled  # fmt: skip
-    """Draw one mesh in one tile: 1 - coverage, and the order value, in the exact mode.
+INTERPRETED = not isinstance(corners_of, triton.JITFunction)
+"""True if Triton's interpreter runs the kernels, on tensors of any device."""
 
-    The order value is the depth at pixels whose centre lies in a face, the negative depth in the
-    halo (the blur outside the faces), and minus infinity elsewhere.
-    """
-    mesh, top_row, left_column, row, column, at = tile_pixels(windows, first_tiles, tile_meshes)
-    real = missed.dtype.element_ty
-    px, py = column.to(real) + 0.5, row.to(real) + 0.5
-    # odds = prod_f (1 + e^x_f). If it overflows to infinity, missed = 1 / odds is 0.
-    odds = tl.full((TILE * TILE,), 1, real)
-    inverse_inside = tl.zeros((TILE * TILE,), real)  # 1 / depth; 0 is infinitely far
-    inverse_halo = tl.zeros((TILE * TILE,), real)
-    inverse_sigma = 1.0 / sigma
-    row_size = block_count * BLOCK
-    block_bounds += mesh * 4 * block_count
-    face_bounds += mesh * 4 * row_size
-    for group in range(0, block_count, BLOCK):
-        blocks = hits(block_bounds, group, block_count, block_count, top_row, left_column)
-        while blocks != 0:
-            first = (group + first_bit(blocks)) * BLOCK
-            blocks &= blocks - 1
-            found = hits(face_bounds, first, row_size, row_size, top_row, left_column)
-            while found != 0:
-                face = first + first_bit(found)
-                found &= found - 1
-                a, b, c, ax, ay, bx, by, cx, cy = corners_of(
-                    pixels, faces, face, mesh * vertex_count, True, real
-                )
-                ia, ib = tl.load(inverse_depths + a), tl.load(inverse_depths + b)
-                ic = tl.load(inverse_depths + c)
-                rx, ry, _, wc = to_edge(px, py, ax, ay, bx, by)
-                distance = rx * rx + ry * ry
-                rx, ry, _, wa = to_edge(px, py, bx, by, cx, cy)
-                distance = tl.minimum(distance, rx * rx + ry * ry)
-                rx, ry, _, wb = to_edge(px, py, cx, cy, ax, ay)
-                distance = tl.minimum(distance, rx * rx + ry * ry)
-                area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-                turn = tl.where(area > 0, 1.0, -1.0)
-                wa, wb, wc = wa * turn, wb * turn, wc * turn
-                least = tl.minimum(tl.minimum(wa, wb), wc)
-                inside = least > 0
-                contained = least + SLACK * tl.abs(area) > 0
-                halo = (distance < blur) & (inside == 0)
-                x = tl.minimum(tl.where(inside, distance, -distance) * inverse_sigma, 80.0)
-                odds *= tl.where(inside | halo, 1.0 + tl.exp(x), 1.0)
-                wa, wb, wc = tl.maximum(wa, 0.0), tl.maximum(wb, 0.0), tl.maximum(wc, 0.0)
-                total = wa + wb + wc
-                # Far from a sliver, all weights may round to 0; then the nearest corner is used.
-                inverse = tl.where(
-                    total > 0,
-                    (wa * ia + wb * ib + wc * ic) / tl.where(total > 0, total, 1.0),
-                    tl.maximum(tl.maximum(ia, ib), ic),
-                )
-                inverse_inside = tl.maximum(inverse_inside, tl.where(contained, inverse, 0.0))
-                inverse_halo = tl.maximum(inverse_halo, tl.where(halo, inverse, 0.0))
-    tl.store(missed + at, 1.0 / odds)
-    value = tl.where(inverse_inside > 0, 1.0 / inverse_inside, -1.0 / inverse_halo)
-    tl.store(order + at, value)
+REACH_MARGIN_PX = 1e-3
+"""Added to the blur radius, so that a face misses no pixel by rounding."""
+
+
+@triton.jit
+def _store4(to, row_size, first, second, third, fourth, mask):  # pragma: no cover - compiled
+    tl.store(to, first.to(tl.int16), mask=mask)
+    tl.store(to + row_size, second.to(tl.int16), mask=mask)
+    tl.store(to + 2 * row_size, third.to(tl.int16), mask=mask)
+    tl.store(to + 3 * row_size, fourth.to(tl.int16), mask=mask)
+
+
+@triton.jit
+def bound_faces(
+    pixels, depths, faces, drawn, face_bounds, block_bounds, windows,
+    vertex_count, face_count, block_count, height, width, reach, near, GROUP: tl.constexpr,
+):  # pragma: no cover - compiled  # fmt: skip
+    """First and last row and column that each face, block and mesh may touch."""
+    mesh = tl.program_id(0).to(tl.int64)
+    shown = tl.where(tl.load(drawn + mesh) != 0, face_count, 0)
+    mesh_first_row, mesh_last_row = height, -1
+    mesh_first_column, mesh_last_column = width, -1
+    for group in range(0, block_count, GROUP):
+        block = group + tl.arange(0, GROUP)
+        face = block[:, None] * BLOCK + tl.arange(0, BLOCK)[None, :]
+        exists = face < shown
+        a, b, c, ax, ay, bx, by, cx, cy = corners_of(
+            pixels, faces, face, mesh * vertex_count, exists, pixels.dtype.element_ty
+        )
+        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+        keep = are_drawn(depths, a, b, c, area, exists, near)
+        low = tl.ceil(tl.minimum(tl.minimum(ay, by), cy) - reach - 0.5)
+        high = tl.floor(tl.maximum(tl.maximum(ay, by), cy) + reach - 0.5)
+        first_row = tl.minimum(tl.maximum(low, 0), height).to(tl.int32)
+        last_row = tl.maximum(tl.minimum(high, height - 1), -1).to(tl.int32)
+        low = tl.ceil(tl.minimum(tl.minimum(ax, bx), cx) - reach - 0.5)
+        high = tl.floor(tl.maximum(tl.maximum(ax, bx), cx) + reach - 0.5)
+        first_column = tl.minimum(tl.maximum(low, 0), width).to(tl.int32)
+        last_column = tl.maximum(tl.minimum(high, width - 1), -1).to(tl.int32)
+        keep &= (first_row <= last_row) & (first_column <= last_column)
+        first_row = tl.where(keep, first_row, EMPTY)
+        last_row = tl.where(keep, last_row, -1)
+        first_column = tl.where(keep, first_column, EMPTY)
+        last_column = tl.where(keep, last_column, -1)
+
+        row_size = block_count * BLOCK
+        to = face_bounds + mesh * 4 * row_size + face
+        known = block[:, None] < block_count
+        _store4(to, row_size, first_row, last_row, first_column, last_column, known)
+        low_row, high_row = tl.min(first_row, axis=1), tl.max(last_row, axis=1)
+        low_column, high_column = tl.min(first_column, axis=1), tl.max(last_column, axis=1)
+        to = block_bounds + mesh * 4 * block_count + block
+        known = block < block_count
+        _store4(to, block_count, low_row, high_row, low_column, high_column, known)
+        mesh_first_row = tl.minimum(mesh_first_row, tl.min(low_row, axis=0))
+        mesh_last_row = tl.maximum(mesh_last_row, tl.max(high_row, axis=0))
+        mesh_first_column = tl.minimum(mesh_first_column, tl.min(low_column, axis=0))
+        mesh_last_column = tl.maximum(mesh_last_column, tl.max(high_column, axis=0))
+    top, left = mesh_first_row // TILE, mesh_first_column // TILE
+    seen = mesh_last_row >= 0
+    tl.store(windows + mesh * 4, top)
+    tl.store(windows + mesh * 4 + 1, left)
+    tl.store(windows + mesh * 4 + 2, tl.where(seen, mesh_last_row // TILE - top + 1, 0))
+    tl.store(windows + mesh * 4 + 3, tl.where(seen, mesh_last_column // TILE - left + 1, 0))
+
+
+class Windows(NamedTuple):
+    """The parts of the images that the meshes may touch."""
+
+    face_bounds: Tensor
+    block_bounds: Tensor
+    places: Tensor
+    """Top, left, rows and columns of each mesh, in tiles."""
+
+    first_tiles: Tensor
+    """Number of packed tiles before those of each mesh."""
+
+    tile_meshes: Tensor
+    """Mesh of each packed tile."""
+
+
+def reach_of(settings: Settings) -> float:
+    """Blur radius of a face or an outline in pixels, rounded up by a margin."""
+    return settings.blur_px2**0.5 + REACH_MARGIN_PX
+
+
+def tiles_across(pixels: int) -> int:
+    return -(-pixels // TILE.value)
+
+
+def find_windows(
+    pixels: Tensor, depths: Tensor, faces: Tensor, drawn: Tensor, settings: Settings
+) -> Windows:
+    """Windows of all meshes. Synchronises with the device to read the number of tiles."""
+    meshes = (pixels, depths, faces, drawn.to(torch.uint8).contiguous(), settings)
+    face_bounds, block_bounds, places = _bound(*meshes, reach_of(settings))
+    if settings.mode == "fast":
+        # The window includes the blur, but faces are rasterised hard, with separate bounds.
+        face_bounds, block_bounds, _ = _bound(*meshes, REACH_MARGIN_PX)
+    counts = places[:, 2].long() * places[:, 3]
+    ends = counts.cumsum(dim=0)
+    every = torch.arange(len(counts), dtype=torch.int32, device=pixels.device)
+    tile_meshes = every.repeat_interleave(counts, output_size=int(ends[-1]) if len(ends) else 0)
+    return Windows(face_bounds, block_bounds, places, ends - counts, tile_meshes)
+
+
+def _bound(
+    pixels: Tensor, depths: Tensor, faces: Tensor, drawn: Tensor, settings: Settings, reach: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    images, objects, vertices = depths.shape
+    meshes, blocks = images * objects, -(-len(faces) // BLOCK.value)
+    bounds = torch.empty((meshes, 4, blocks * BLOCK.value), dtype=torch.int16, device=pixels.device)
+    block_bounds = torch.empty((meshes, 4, blocks), dtype=torch.int16, device=pixels.device)
+    places = torch.empty((meshes, 4), dtype=torch.int32, device=pixels.device)
+    # Fused multiply-adds are off: their rounding would give degenerate faces an area.
+    launch(
+        bound_faces, meshes, pixels, depths, faces, drawn, bounds, block_bounds,
+        places, vertices, len(faces), blocks, *settings.image_size, reach, settings.near_m,
+        GROUP=8, num_warps=4, enable_fp_fusion=False,
+    )  # fmt: skip
+    return bounds, block_bounds, places
+
+
+class Edges(NamedTuple):
+    """Edges of a mesh; the faces at edge e are faces[first_faces[e] : first_faces[e + 1]]."""
+
+    ends: Tensor
+    """(edges, 2) vertices, the lower first."""
+
+    first_faces: Tensor
+    faces: Tensor
+    ways: Tensor
+    """+1 if the face traverses the edge from its first to its second vertex, else -1."""
+
+
+_known: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
+
+
+def edges_of(faces: Tensor) -> Edges:
+    """Edges of a mesh, on its device; cached until `faces` is modified."""
+    if faces.is_inference():  # an inference tensor has no version counter
+        return _read_edges(faces)
+    version, edges = _known.get(faces, (None, None))
+    if version != faces._version:
+        version, edges = faces._version, _read_edges(faces)
+        _known[faces] = version, edges
+    return edges
+
+
+def _read_edges(faces: Tensor) -> Edges:
+    ends, edge_of, way = (torch.from_numpy(part) for part in topology_of(faces.cpu().numpy()))
+    owners, places = edge_of.flatten().sort(stable=True)
+    first = torch.searchsorted(owners, torch.arange(len(ends) + 1, dtype=owners.dtype))
+    parts = (ends, first, places // 3, way.flatten()[places])
+    return Edges(*(part.int().to(faces.device) for part in parts))
+
+
+def launch(kernel: Any, programs: int, first: Tensor, *arguments: Any, **options: Any) -> None:
+    """Run a kernel on the device of its first argument."""
+    # Stated explicitly, since Triton 3.10 changes the default; callers may turn it off.
+    options = {"enable_fp_fusion": True} | options
+    if programs > 0:
+        with torch.cuda.device_of(first):
+            kernel[(programs,)](first, *arguments, **options)
