@@ -34,8 +34,7 @@ from sceneprior.evaluation.metrics.picture_distances import FRECHET
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
 from sceneprior.evaluation.view_scores import f_score, sample_surface
 from sceneprior.paper.prior import TrainedPrior
-from sceneprior.render.appearance import box_mesh
-from sceneprior.render.pictures import contact_sheet
+from sceneprior.render.appearance import box_mesh, contact_sheet
 from sceneprior.render.topdown import corner_view, perspective
 
 SPHERE_LEVEL = 3

@@ -281,7 +281,7 @@ def inspect(
     from data_prep.inspection.tables import count_tables, room_table
     from sceneprior.core.errors import InputError
     from sceneprior.core.files import write_whole
-    from sceneprior.render.pictures import png_bytes
+    from sceneprior.render.appearance import png_bytes
 
     if verify:
         _verify(shards, room, workers)

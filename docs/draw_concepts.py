@@ -41,7 +41,7 @@ from sceneprior.paper.losses import soft_iou
 from sceneprior.paper.matching import match_objects, matching_cost, seen_boxes
 from sceneprior.paper.prior import LatentSphere, TrainedPrior
 from sceneprior.paper.sampling import decode_latents, latent_of
-from sceneprior.render.pictures import contact_sheet, paint_ids, png_bytes
+from sceneprior.render.appearance import contact_sheet, paint_ids, png_bytes
 from sceneprior.render.silhouettes import render_silhouettes
 from sceneprior.render.topdown import corner_view, perspective
 

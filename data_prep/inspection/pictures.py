@@ -17,7 +17,7 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.observations import RoomGroundTruth, RoomViews
 from sceneprior.core.shards import Shard, list_shards
 from sceneprior.core.wall_lines import find_walls, seen_floor
-from sceneprior.render.pictures import contact_sheet, paint_ids
+from sceneprior.render.appearance import contact_sheet, paint_ids
 
 BACKGROUND = (246, 246, 246)
 GRID = (206, 206, 206)

@@ -15,7 +15,7 @@ from sceneprior.core.scene import Scene
 from sceneprior.core.scene_json import FORMAT
 from sceneprior.core.shell import ShellName
 from sceneprior.paper.sampling import LATENTS_FILE, write_latents
-from sceneprior.render.pictures import contact_sheet, png_bytes
+from sceneprior.render.appearance import contact_sheet, png_bytes
 from sceneprior.render.scene_files import check_names, format_of, save
 from sceneprior.render.topdown import perspective, view_of
 

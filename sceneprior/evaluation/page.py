@@ -21,8 +21,7 @@ from sceneprior.core.files import write_whole
 from sceneprior.core.scene import Mesh, Scene
 from sceneprior.core.shell import ShellName, shell_of
 from sceneprior.core.surfaces import decimate
-from sceneprior.render.appearance import quiet_colors
-from sceneprior.render.pictures import png_bytes
+from sceneprior.render.appearance import png_bytes, quiet_colors
 from sceneprior.render.scene_files import scene_to_glb
 from sceneprior.render.topdown import (
     corner_view,

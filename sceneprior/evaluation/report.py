@@ -32,8 +32,7 @@ from sceneprior.evaluation.score_table import (
     relation_rows,
     score_rows,
 )
-from sceneprior.render.appearance import quiet_colors
-from sceneprior.render.pictures import paint_ids
+from sceneprior.render.appearance import paint_ids, quiet_colors
 
 ROOMS_SHOWN = 8
 DECODED_SHOWN = 5

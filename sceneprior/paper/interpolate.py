@@ -24,8 +24,7 @@ from sceneprior.paper.sampling import (
     kept_predictions,
     latent_of,
 )
-from sceneprior.render.appearance import quiet_colors
-from sceneprior.render.pictures import contact_sheet, gif_bytes, png_bytes
+from sceneprior.render.appearance import contact_sheet, gif_bytes, png_bytes, quiet_colors
 from sceneprior.render.topdown import corner_view, perspective
 
 STEPS = 129

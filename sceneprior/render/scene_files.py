@@ -22,11 +22,11 @@ from sceneprior.render.appearance import (
     linear_rgba,
     node_names,
     object_colors,
+    png_bytes,
     scene_meshes,
     shell_color,
 )
 from sceneprior.render.model_files import joined, load_parts
-from sceneprior.render.pictures import png_bytes
 from sceneprior.render.scene_simulators import scene_to_usd
 
 NO_SHELL: Mapping[str, Mesh] = {}
@@ -90,28 +90,29 @@ def scene_to_glb(scene: Scene, shell: Mapping[str, Mesh] = NO_SHELL) -> bytes:
     """The scene as binary glTF 2.0: a named node, mesh and material per object, or a node with a
     child per material if the object is textured; no cameras.
 
-    The `extras` of its glTF scene have the entry `sceneprior`; see `glb_extras`.
+    The `extras` of its glTF scene have the entry `sceneprior` with name, label set, `extra`, and
+    each object's node and class, with its yaw where known (docs/conventions.md).
 
     Args:
         shell: Meshes of the room by the names of their nodes (`core/shell.py`).
     """
-    if not scene.objects and not shell:
-        return _empty_glb(glb_extras(scene))
-    room = _trimesh_of(scene, shell)
-    room.metadata.update(glb_extras(scene))
-    # Without normals, viewers use flat shading, and boxes keep sharp edges.
-    return bytes(room.export(file_type="glb", include_normals=False))
-
-
-def glb_extras(scene: Scene) -> dict[str, Any]:
-    """Metadata of a scene in its GLB: name, label set, `extra`, and each object's node and class,
-    with its yaw where known (docs/conventions.md)."""
     objects = [
         {"node": node, "class": item.label, **item.facing}
         for node, item in zip(node_names(scene), scene.objects, strict=True)
     ]
     told = {"name": scene.name, "label_set": scene.label_set, "extra": scene.extra}
-    return {"sceneprior": {**told, "objects": objects}}
+    extras = {"sceneprior": {**told, "objects": objects}}
+    if scene.objects or shell:
+        room = _trimesh_of(scene, shell)
+        room.metadata.update(extras)
+        # Without normals, viewers use flat shading, and boxes keep sharp edges.
+        return bytes(room.export(file_type="glb", include_normals=False))
+    # trimesh does not export a scene without geometry, but an empty room is valid.
+    scenes = [{"extras": extras}]
+    text = json.dumps({"asset": {"version": "2.0"}, "scene": 0, "scenes": scenes}).encode()
+    text += b" " * (-len(text) % 4)
+    header = np.array([0x46546C67, 2, 20 + len(text), len(text), 0x4E4F534A], dtype="<u4")
+    return header.tobytes() + text
 
 
 def scene_to_obj(
@@ -135,55 +136,44 @@ def scene_to_obj(
 
 def _trimesh_of(scene: Scene, shell: Mapping[str, Mesh]) -> Any:
     import trimesh
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
 
     room = trimesh.Scene(base_frame="room")
+
+    def add(
+        node: str, label: str, part: Textured, color: np.ndarray, parent: str | None = None
+    ) -> None:
+        surface = part.material or PBRMaterial(
+            name=label,
+            baseColorFactor=linear_rgba(color),
+            metallicFactor=0.0,
+            roughnessFactor=0.9,
+            # A learned mesh may fold over itself, so its back faces are drawn. Walls are closed, or
+            # should be invisible from behind.
+            doubleSided=not is_shell(node),
+        )
+        geometry = trimesh.Trimesh(
+            np.asarray(part.mesh.vertices_m, dtype=np.float64),
+            np.asarray(part.mesh.faces, dtype=np.int64),
+            process=False,
+            visual=TextureVisuals(uv=part.uv, material=surface),
+        )
+        room.add_geometry(geometry, node_name=node, geom_name=node, parent_node_name=parent)
+
     meshes, colors = scene_meshes(scene), object_colors(scene)
     for node, item, mesh, color in zip(
         node_names(scene), scene.objects, meshes, colors, strict=True
     ):
         if not item.textured:
-            _add(room, node, item.label, Textured(mesh), color)
+            add(node, item.label, Textured(mesh), color)
             continue
         room.graph.update(frame_from=room.graph.base_frame, frame_to=node)
         for number, part in enumerate(item.textured):
-            _add(room, f"{node}/{number}", item.label, part, color, node)
+            add(f"{node}/{number}", item.label, part, color, node)
     for node, mesh in shell.items():
-        _add(room, node, node.partition("_")[0], Textured(mesh), shell_color(node))
+        add(node, node.partition("_")[0], Textured(mesh), shell_color(node))
     return room
-
-
-def _add(
-    room: Any, node: str, label: str, part: Textured, color: np.ndarray, parent: str | None = None
-) -> None:
-    import trimesh
-    from trimesh.visual import TextureVisuals
-    from trimesh.visual.material import PBRMaterial
-
-    surface = part.material or PBRMaterial(
-        name=label,
-        baseColorFactor=linear_rgba(color),
-        metallicFactor=0.0,
-        roughnessFactor=0.9,
-        # A learned mesh may fold over itself, so its back faces are drawn. Walls are closed, or
-        # should be invisible from behind.
-        doubleSided=not is_shell(node),
-    )
-    geometry = trimesh.Trimesh(
-        np.asarray(part.mesh.vertices_m, dtype=np.float64),
-        np.asarray(part.mesh.faces, dtype=np.int64),
-        process=False,
-        visual=TextureVisuals(uv=part.uv, material=surface),
-    )
-    room.add_geometry(geometry, node_name=node, geom_name=node, parent_node_name=parent)
-
-
-def _empty_glb(extras: dict[str, Any]) -> bytes:
-    # trimesh does not export a scene without geometry, but an empty room is valid.
-    scenes = [{"extras": extras}]
-    text = json.dumps({"asset": {"version": "2.0"}, "scene": 0, "scenes": scenes}).encode()
-    text += b" " * (-len(text) % 4)
-    header = np.array([0x46546C67, 2, 20 + len(text), len(text), 0x4E4F534A], dtype="<u4")
-    return header.tobytes() + text
 
 
 def read_glb_parts(path: Path, with_materials: bool = False) -> dict[str, list[Textured]]:
@@ -250,7 +240,13 @@ def load_scene_folder(folder: Path, with_materials: bool = False) -> list[Scene]
     if not folder.is_dir():
         _refuse_box_lists(folder, [folder])
         raise InputError(f"No folder of scenes at {folder}; `sceneprior synthesize` writes one.")
-    paths = sorted(folder.glob("*.json"), key=_counting_order)
+    # Zero-padded numbers sort like numbers.
+    paths = sorted(
+        folder.glob("*.json"),
+        key=lambda path: [
+            part.zfill(20) if part.isdigit() else part for part in re.split(r"(\d+)", path.stem)
+        ],
+    )
     # Unreadable files (format None) are not skipped, so that load_scene reports their error.
     formats = {path: format_of(path) for path in paths}
     scenes = [
@@ -280,25 +276,21 @@ def load_scene_folder(folder: Path, with_materials: bool = False) -> list[Scene]
 def _refuse_box_lists(given: Path, paths: Iterable[Path]) -> None:
     """Raise an `InputError` that names the conversion command if a path is a box list of ATISS."""
     for path in paths:
-        if _is_box_list(path):
+        try:
+            if path.suffix == ".npz":
+                with zipfile.ZipFile(path) as file:
+                    keys = [name.removesuffix(".npy") for name in file.namelist()]
+            else:
+                data = read_json(path)
+                keys = data[0] if isinstance(data, list) and data else data
+        except (OSError, zipfile.BadZipFile, InputError):
+            continue
+        if isinstance(keys, list | dict) and "class_labels" in keys:
             raise InputError(
                 f"{given} holds box lists ({path.name}), not scenes; `sceneprior export {given} "
                 "--to scenes --label-set front3d_bedroom --out DIR` converts them, if you give the "
                 "label set of their classes."
             )
-
-
-def _is_box_list(path: Path) -> bool:
-    key = "class_labels"
-    try:
-        if path.suffix == ".npz":
-            with zipfile.ZipFile(path) as file:
-                return f"{key}.npy" in file.namelist()
-        data = read_json(path)
-    except (OSError, zipfile.BadZipFile, InputError):
-        return False
-    record = data[0] if isinstance(data, list) and data else data
-    return isinstance(record, dict) and key in record
 
 
 def check_names(scenes: Sequence[Scene]) -> None:
@@ -315,12 +307,6 @@ def check_names(scenes: Sequence[Scene]) -> None:
                 f"A room is called {ascii(name)[:60]}, which cannot be the name of a file; give it "
                 "a short one without slashes (`name` in its JSON)."
             )
-
-
-def _counting_order(path: Path) -> list[str]:
-    # Zero-padded numbers sort like numbers.
-    parts = re.split(r"(\d+)", path.stem)
-    return [part.zfill(20) if part.isdigit() else part for part in parts]
 
 
 def format_of(path: Path) -> str | None:

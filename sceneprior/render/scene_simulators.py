@@ -21,7 +21,7 @@ from sceneprior.core.colliders import (
     volume_and_centroid,
 )
 from sceneprior.core.errors import InputError
-from sceneprior.core.scene import Mesh, Scene, SceneObject, Solid
+from sceneprior.core.scene import Mesh, Scene, Solid
 from sceneprior.core.shell import THICK_M, Shell, Wall
 from sceneprior.render.appearance import (
     FLOOR_COLOR,
@@ -173,7 +173,18 @@ def scene_to_mjcf(scene: Scene, shell: Shell | None = None) -> str:
     for node, item, color in zip(
         node_names(scene), scene.objects, object_colors(scene), strict=True
     ):
-        _add_body(world, assets, node, item, color / 255)
+        center = np.asarray(item.center_m)
+        body = SubElement(world, "body", name=node, pos=_numbers(TO_Z_UP @ center))
+        if not is_fixed(item):
+            SubElement(body, "freejoint")
+        bodies = colliders(item)
+        volumes = np.array([volume_and_centroid(each)[0] for each in bodies])
+        masses = mass_kg(item) * volumes / volumes.sum()
+        rgba = _numbers(np.append(color / 255, 1))
+        for number, (each, mass) in enumerate(zip(bodies, masses, strict=True)):
+            name = f"{node}_{number}"
+            shape = _shape(each, center, assets, name)
+            SubElement(body, "geom", shape, name=name, mass=f"{mass:.6g}", rgba=rgba)
     for row, wall in enumerate(shell.walls if shell else ()):
         height_m = shell.height_m if shell else 0.0
         for number, (center, half) in enumerate(boxes_of_wall(wall, height_m)):
@@ -185,22 +196,6 @@ def scene_to_mjcf(scene: Scene, shell: Shell | None = None) -> str:
             )  # fmt: skip
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
-
-
-def _add_body(
-    world: Element, assets: Element, name: str, item: SceneObject, color: Float[np.ndarray, "3"]
-) -> None:
-    center = np.asarray(item.center_m)
-    body = SubElement(world, "body", name=name, pos=_numbers(TO_Z_UP @ center))
-    if not is_fixed(item):
-        SubElement(body, "freejoint")
-    bodies = colliders(item)
-    volumes = np.array([volume_and_centroid(each)[0] for each in bodies])
-    masses = mass_kg(item) * volumes / volumes.sum()
-    for number, (each, mass) in enumerate(zip(bodies, masses, strict=True)):
-        shape = _shape(each, center, assets, f"{name}_{number}")
-        geom = SubElement(body, "geom", shape, name=f"{name}_{number}")
-        geom.attrib |= {"mass": f"{mass:.6g}", "rgba": _numbers(np.append(color, 1))}
 
 
 def boxes_of_wall(

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, UInt8, UInt16
 from PIL import Image, ImageDraw, ImageFont
 
 from sceneprior.core.cameras import Orthographic, Pinhole, look_at
@@ -24,10 +24,11 @@ from sceneprior.render.appearance import (
     FLOOR_COLOR,
     WALL_COLOR,
     object_colors,
+    paint_ids,
+    png_bytes,
     scene_meshes,
 )
 from sceneprior.render.offscreen import SoftwareRenderer
-from sceneprior.render.pictures import paint_ids, png_bytes
 
 DIRECTION = np.array([0.42, 0.62, 0.66])
 """Unit vector from a room towards the camera of `perspective`; 3D models start in this view."""
@@ -82,16 +83,28 @@ def topdown(
         The paper, section 4.2: 512 x 512, orthographic, a colour per category.
     """
     protocol = protocol or topdown_protocol(scene.label_set)
-    ids = np.zeros(protocol.image_size, dtype=np.uint16)
-    if scene.objects:
-        height = protocol.camera_height_m
-        world_to_camera = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, height], [0, 0, 0, 1]])
-        camera = Orthographic(world_to_camera, protocol.metres_per_pixel)
-        ids = SoftwareRenderer().instance_ids(scene_meshes(scene), camera, protocol.image_size)
+    scale, height_m = protocol.metres_per_pixel, protocol.camera_height_m
+    ids = _ids_from_above(scene, np.zeros(2), height_m, scale, protocol.image_size)
     if outlines:
         return paint_ids(ids, object_colors(scene), protocol.background)
     colors = class_colors(len(label_set(scene.label_set)))[scene.class_indices]
     return np.concatenate([[protocol.background], colors]).astype(np.uint8)[ids]
+
+
+def _ids_from_above(
+    scene: Scene,
+    center: Float[np.ndarray, "2"],
+    height_m: float,
+    metres_per_pixel: float,
+    image_size: tuple[int, int],
+) -> UInt16[np.ndarray, "height width"]:
+    """Instance ids seen by an orthographic camera above `center` (x, z)."""
+    if not scene.objects:
+        return np.zeros(image_size, dtype=np.uint16)
+    x, z = center
+    pose = np.array([[1.0, 0, 0, -x], [0, 0, 1, -z], [0, -1, 0, height_m], [0, 0, 0, 1]])
+    camera = Orthographic(pose, metres_per_pixel)
+    return SoftwareRenderer().instance_ids(scene_meshes(scene), camera, image_size)
 
 
 @dataclass(frozen=True)
@@ -111,23 +124,17 @@ def shows_walls(scene: Scene, shell: ShellName) -> bool:
 
 
 def view_of(scene: Scene, image_size: tuple[int, int], shell: ShellName = "none") -> CornerView:
-    """The view of a single room, with walls according to `shows_walls`."""
-    if shows_walls(scene, shell):
-        return room_view(scene, image_size)
-    return corner_view([scene], image_size)
-
-
-def room_view(scene: Scene, image_size: tuple[int, int] = (360, 480)) -> CornerView:
     """A view of a room from outside, above a corner, that just contains it.
 
-    It shows the floor, the furniture, and the walls that lie behind the furniture as seen from the
-    camera; the other walls are left out.
+    It shows the floor and the furniture. With walls (`shows_walls`), it also shows those that lie
+    behind the furniture as seen from the camera; the other walls are left out.
     """
-    shell = shell_of(scene)
-    meshes = shell.meshes()
-    toward = DIRECTION[[0, 2]]
-    behind = (f"wall_{row}" for row, wall in enumerate(shell.walls) if wall.outward @ toward < 0)
-    walls = tuple(meshes[name] for name in behind)
+    if not shows_walls(scene, shell):
+        return corner_view([scene], image_size)
+    around = shell_of(scene)
+    meshes, toward = around.meshes(), DIRECTION[[0, 2]]
+    behind = [row for row, wall in enumerate(around.walls) if wall.outward @ toward < 0]
+    walls = tuple(meshes[f"wall_{row}"] for row in behind)
     floor = meshes["floor"]
     return _fitted([floor, *walls, *scene_meshes(scene)], image_size, floor, walls)
 
@@ -232,7 +239,13 @@ def floor_plan(scene: Scene) -> UInt8[np.ndarray, "512 662 3"]:
     Objects have flat class colours and dark borders, and the highest surface hides what is below
     it. To the right stand a legend of the classes and a scale bar.
     """
-    center, side_m = _window(scene)
+    points = [mesh.vertices_m[:, [0, 2]] for mesh in scene_meshes(scene)]
+    if scene.floor_m is not None:
+        points.append(np.asarray(scene.floor_m, dtype=np.float64))
+    every = np.concatenate(points) if points else np.zeros((1, 2))
+    low, high = every.min(axis=0), every.max(axis=0)
+    center = (low + high) / 2
+    side_m = max(float((high - low).max()) / (1 - 2 * BORDER), LEAST_M)
     picture = Image.new("RGB", (PLAN_PX + LEGEND_PX, PLAN_PX), BACKGROUND)
     picture.paste(plan_of(scene, center, side_m))
     _legend(ImageDraw.Draw(picture), scene, PLAN_PX / side_m)
@@ -242,14 +255,9 @@ def floor_plan(scene: Scene) -> UInt8[np.ndarray, "512 662 3"]:
 def plan_of(scene: Scene, center: Float[np.ndarray, "2"], side_m: float) -> Image.Image:
     """Draw the square of a room around `center` (x, z), without a legend, 512 x 512 pixels."""
     scale = PLAN_PX / side_m
-    ids = np.zeros((PLAN_PX, PLAN_PX), dtype=np.uint16)
-    colors = object_colors(scene)
-    if scene.objects:
-        meshes = scene_meshes(scene)
-        height_m = max(float(mesh.vertices_m[:, 1].max()) for mesh in meshes) + 1
-        x, z = center
-        camera = np.array([[1.0, 0, 0, -x], [0, 0, 1, -z], [0, -1, 0, height_m], [0, 0, 0, 1]])
-        ids = SoftwareRenderer().instance_ids(meshes, Orthographic(camera, 1 / scale), ids.shape)
+    tops = [float(mesh.vertices_m[:, 1].max()) for mesh in scene_meshes(scene)]
+    height_m = max(tops, default=0.0) + 1
+    ids = _ids_from_above(scene, center, height_m, 1 / scale, (PLAN_PX, PLAN_PX))
     plan = Image.new("RGB", (PLAN_PX, PLAN_PX), BACKGROUND)
     draw = ImageDraw.Draw(plan)
 
@@ -263,20 +271,9 @@ def plan_of(scene: Scene, center: Float[np.ndarray, "2"], side_m: float) -> Imag
     for opening in scene.openings:
         ends = pixels(np.array([opening.start_m, opening.end_m]))
         draw.line(ends, fill=DOOR if opening.kind == "door" else WINDOW, width=7)
-    painted = Image.fromarray(paint_ids(ids, colors, BACKGROUND))
+    painted = Image.fromarray(paint_ids(ids, object_colors(scene), BACKGROUND))
     plan.paste(painted, mask=Image.fromarray(np.uint8(255) * (ids > 0)))
     return plan
-
-
-def _window(scene: Scene) -> tuple[Float[np.ndarray, "2"], float]:
-    """Centre (x, z) and side in metres of the square that the plan shows."""
-    points = [mesh.vertices_m[:, [0, 2]] for mesh in scene_meshes(scene)]
-    if scene.floor_m is not None:
-        points.append(np.asarray(scene.floor_m, dtype=np.float64))
-    every = np.concatenate(points) if points else np.zeros((1, 2))
-    low, high = every.min(axis=0), every.max(axis=0)
-    side_m = max(float((high - low).max()) / (1 - 2 * BORDER), LEAST_M)
-    return (low + high) / 2, side_m
 
 
 def _legend(draw: ImageDraw.ImageDraw, scene: Scene, scale: float) -> None:

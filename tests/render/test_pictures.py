@@ -5,7 +5,7 @@ import io
 import numpy as np
 from PIL import Image
 
-from sceneprior.render.pictures import CAPTION_PX, contact_sheet, paint_ids, png_bytes
+from sceneprior.render.appearance import CAPTION_PX, contact_sheet, paint_ids, png_bytes
 
 
 def plain(height, width, value):

@@ -16,9 +16,15 @@ from sceneprior.core.files import write_whole
 from sceneprior.core.scene import Scene
 from sceneprior.core.views import ObservedImage
 from sceneprior.evaluation.page import png_uri, write_rooms_page
-from sceneprior.render.appearance import object_colors, quiet_colors, scene_meshes
+from sceneprior.render.appearance import (
+    contact_sheet,
+    object_colors,
+    paint_ids,
+    png_bytes,
+    quiet_colors,
+    scene_meshes,
+)
 from sceneprior.render.offscreen import SoftwareRenderer
-from sceneprior.render.pictures import contact_sheet, paint_ids, png_bytes
 from sceneprior.render.topdown import topdown, topdown_protocol
 
 HEIGHT_PX = 360

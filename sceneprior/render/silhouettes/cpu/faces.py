@@ -1,6 +1,6 @@
 """The exact mode on the CPU: the formula over every face near a pixel.
 
-Buffers hold, for each pixel of each window (windows.py),
+Buffers hold, for each pixel of each window (kernels.py),
 
     odds  P = prod_f (1 + exp(x_f)), x_f = +-d_f / sigma, so that coverage = 1 - 1 / P, and
     order the depth order (larger is nearer): 1 / z of the nearest face that contains the pixel
