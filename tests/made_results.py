@@ -49,14 +49,14 @@ def made_columns(start: float, keys: list[str] = KEYS) -> dict[str, Any]:
     return values | {keys[2]: None}
 
 
-def write_new_rooms(path: Path, number: int, latents: str | None, remembers: bool) -> None:
-    """A result of `eval-fid`; `latents` None is that of scenes."""
+def write_new_rooms(path: Path, number: int, latents: str, remembers: bool) -> None:
+    """A result of `eval-fid`."""
     scores = made_columns(1.25 + number)
     ends = {key: [0.9 * value, 1.1 * value] for key, value in scores.items() if value}
-    protocol = {"n_generated": 4, "n_test": 3, "n_train_rooms": 12, "shards": "front"}
+    counts = {"n_generated": 4, "n_test": 3, "n_train_rooms": 12}
     scores |= {
         "intervals": {"generated": ends},
-        "protocol": protocol | ({} if latents is None else {"latents": latents}),
+        "protocol": {**counts, "shards": "front", "latents": latents},
         "independent": made_columns(9.5, KEYS[:6]),
         "independent_meshes": made_columns(7.5, KEYS[:4]),
         "shuffled": made_columns(5.5, KEYS[3:]),

@@ -1,10 +1,8 @@
 """Trains and evaluates the runs of a comparison, and writes its tables.
 
-A run consists of `fit` and the commands that score it; for existing scenes, of the scoring commands
-alone. Finished commands are not repeated.
+A run consists of `fit` and the commands that score it. Finished commands are not repeated.
 """
 
-import hashlib
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -142,9 +140,9 @@ def commands_of(
     inception: Path | None = None,
     accelerator: str = "auto",
 ) -> list[Command]:
-    """The commands of a run: `fit`, unless it is a folder of scenes, and for each of its variants
-    `eval-fid` or `eval-svr`, which depends on the settings that all rows of a table share."""
-    shards, state = str(shards_of(comparison, run.rooms)), list[str]()
+    """The commands of a run: `fit`, and for each of its variants `eval-fid` or `eval-svr`, which
+    depends on the settings that all rows of a table share."""
+    shards = str(shards_of(comparison, run.rooms))
     source = ["--run", str(run.folder / "run")]
     shared = ["--seed", str(comparison.sampling_seed)]
     if isinstance(comparison, ViewComparison):
@@ -157,17 +155,15 @@ def commands_of(
             shared += ["--models", shards if models == OF_SHARDS else models]
     else:
         command, option = "eval-fid", "--distribution"
-        if run.scenes is not None:
-            source, state = ["--scenes", str(run.scenes), "--shards", shards], [_state(run.scenes)]
         # Some methods decode meshes, others boxes only; --boxes compares the boxes of all methods.
         shared = ["-n", str(count), *shared, "--boxes"]
         if inception is not None:
             shared += ["--inception", str(inception)]
-    commands = [] if run.scenes is not None else [_fit(run, accelerator)]
+    commands = [_fit(run, accelerator)]
     for variant in variants_of(comparison, run):
         asked = shared if variant.name is None else [*shared, option, variant.name]
         words = [command, *source, "--out", str(variant.result), *asked]
-        commands.append(Command(variant.result.stem, words, variant.result, asked + state))
+        commands.append(Command(variant.result.stem, words, variant.result, asked))
     return commands
 
 
@@ -180,10 +176,3 @@ def _fit(run: Run, accelerator: str) -> Command:
     result = folder / run.run_config.stage_names[-1] / "final.ckpt"
     # It depends on nothing, because changed settings never repeat it: `keeps_settings` refuses.
     return Command("fit", words, result, depends_on=[], continues=folder / "config.yaml")
-
-
-def _state(scenes: Path) -> str:
-    """A fingerprint of a folder of scenes that changes with its files; the files are not read."""
-    files = sorted(path for path in scenes.glob("*") if path.suffix in (".json", ".glb"))
-    found = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in files]
-    return hashlib.sha256(repr((str(scenes), found)).encode()).hexdigest()

@@ -23,7 +23,7 @@ class Rooms(Section):
 
 
 class Method(Section):
-    """One method of a comparison: a method to train, or existing scenes."""
+    """One method of a comparison."""
 
     title: str | None = None
     """Title of the method's rows. None takes the title from the config (`runs.py`), which works
@@ -35,20 +35,6 @@ class Method(Section):
     set: dict[str, list[str]] = Field(default_factory=dict)
     """Changes to the config as `section.key=value`, by kind of room; changes under `every` are
     applied first."""
-    scenes: dict[str, str] = Field(default_factory=dict)
-    """Folders of scenes, by kind of room, instead of `config` and `set`: nothing is trained, and
-    the scenes are evaluated as they are."""
-
-    @model_validator(mode="after")
-    def _trained_or_given(self) -> "Method":
-        if self.scenes and (self.config is not None or self.set):
-            raise ValueError(
-                "scenes are evaluated as they are, so `config` and `set` have no effect on them; "
-                "leave out `scenes`, or `config` and `set`"
-            )
-        if self.scenes and self.title is None:
-            raise ValueError("scenes need a title, since no config names their method")
-        return self
 
 
 class Comparison(Section):
@@ -78,10 +64,6 @@ class Comparison(Section):
             if unlisted := sorted(set(method.set) - {EVERY, *self.rooms}):
                 raise ValueError(
                     f"methods.{key}.set has '{unlisted[0]}'; expected {EVERY} or one of {known}"
-                )
-            if unlisted := sorted(set(method.scenes) - set(self.rooms)):
-                raise ValueError(
-                    f"methods.{key}.scenes has '{unlisted[0]}'; expected one of {known}"
                 )
         return self
 
@@ -114,16 +96,6 @@ class ViewComparison(Comparison):
     cad_models: str | None = None
     """Value of `eval-svr --models`: a folder of CAD models, or `shards` for the CAD models of the
     training rooms. Null leaves out the rows with CAD models."""
-
-    @model_validator(mode="after")
-    def _answers_the_same_views(self) -> "ViewComparison":
-        for key, method in self.methods.items():
-            if method.scenes:
-                raise ValueError(
-                    f"methods.{key}.scenes: the comparison chooses the views to reconstruct; "
-                    "score existing scenes with `sceneprior eval-svr --scenes`"
-                )
-        return self
 
 
 TASKS: dict[str, type[Comparison]] = {"new_rooms": RoomComparison, "single_views": ViewComparison}

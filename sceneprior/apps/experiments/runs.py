@@ -47,28 +47,24 @@ the way in which rooms are made and by whether the run is of the lifted method."
 
 @dataclass(frozen=True)
 class Run:
-    """One training with one seed, or a folder of scenes, which needs no training."""
+    """One training of a method, on one kind of rooms, with one seed."""
 
     rooms: str
     method: str
-    seed: int | None
-    """Seed of training; None for scenes."""
+    seed: int
     config: str
     settings: tuple[str, ...]
     """Changes to the config, for `fit --set`."""
     folder: Path
-    scenes: Path | None = None
-    """Folder of existing scenes, made by any method; None for a method to train."""
 
     @property
     def run_config(self) -> RunConfig:
-        """The settings of the run's training; for scenes, the config of their kind of rooms."""
+        """The settings of the run's training."""
         return load_config(self.config, self.settings)
 
     @property
     def title(self) -> str:
-        seed = () if self.seed is None else (f"seed {self.seed}",)
-        return ", ".join((self.rooms, self.method, *seed))
+        return f"{self.rooms}, {self.method}, seed {self.seed}"
 
 
 @dataclass(frozen=True)
@@ -109,23 +105,15 @@ def load_comparison(name: str) -> Comparison:
 
 
 def runs_of(comparison: Comparison, out: Path) -> list[Run]:
-    """All runs: scenes first, then seed by seed, so that a comparison stopped early is complete for
-    fewer seeds.
-    """
+    """All runs, seed by seed, so that a comparison stopped early is complete for fewer seeds."""
     runs = []
-    for seed in (None, *comparison.seeds):
-        for (key, rooms), (name, method) in product(
-            comparison.rooms.items(), comparison.methods.items()
-        ):
-            folder = out / key / name
-            if seed is None and key in method.scenes:
-                scenes = Path(method.scenes[key])
-                runs.append(Run(key, name, None, rooms.config, rooms.set, folder, scenes))
-            elif seed is not None and not method.scenes:
-                changes = (*method.set.get(EVERY, ()), *method.set.get(key, ()))
-                settings = (*_of_rooms(rooms, method), *changes, f"seed={seed}")
-                config = method.config or rooms.config
-                runs.append(Run(key, name, seed, config, settings, folder / f"seed{seed}"))
+    for seed, (key, rooms), (name, method) in product(
+        comparison.seeds, comparison.rooms.items(), comparison.methods.items()
+    ):
+        changes = (*method.set.get(EVERY, ()), *method.set.get(key, ()))
+        settings = (*_of_rooms(rooms, method), *changes, f"seed={seed}")
+        config = method.config or rooms.config
+        runs.append(Run(key, name, seed, config, settings, out / key / name / f"seed{seed}"))
     return runs
 
 
@@ -158,7 +146,7 @@ def part_of(
         for run in runs_of(comparison, out)
         if run.method in chosen["method"]
         and run.rooms in chosen["kind of rooms"]
-        and (run.seed is None or str(run.seed) in chosen["seed"])
+        and str(run.seed) in chosen["seed"]
     ]
 
 
@@ -192,11 +180,9 @@ def variants_of(comparison: Comparison, run: Run) -> list[Variant]:
     """The variants of a run, in the order of their rows.
 
     A run that keeps the latents of training rooms has one variant per distribution or fit; its
-    sampler, if it has one, comes first. Scenes and runs of other methods have a single variant.
+    sampler, if it has one, comes first. Runs of other methods have a single variant.
     """
     title = comparison.methods[run.method].title
-    if run.scenes is not None:
-        return [Variant(None, title or "", GIVEN, run.folder / "scores.json")]
     config, views = run.run_config, isinstance(comparison, ViewComparison)
     names: tuple[str | None, ...] = (None,)
     if config.remembers_rooms and isinstance(comparison, ViewComparison):

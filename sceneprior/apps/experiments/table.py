@@ -20,13 +20,11 @@ from sceneprior.paper.sampling import marked
 from sceneprior.training.checkpoints import read_checkpoint
 
 GAP = "–"
-AS_GIVEN = "as given"
 DECODED_ROOMS = "of training rooms, decoded"
 GROUPS = {
     "paper": "rooms of new latents (paper)",
     SAMPLER: "rooms of the lifted method's sampler, object by object",
     "its own": "rooms of methods trained on {}",
-    AS_GIVEN: "scenes as given, made elsewhere",
     DECODED_ROOMS: "training rooms, decoded: nothing is new",
     "kernel": "copies: rooms near training rooms",
 }
@@ -54,8 +52,8 @@ class Row(NamedTuple):
     title: str
     variant: str
     """Value of the second column, which distinguishes the row from other rows of its run."""
-    seed: int | None
-    """Seed of training; None for existing scenes."""
+    seed: int
+    """Seed of training."""
     scores: dict[str, Any]
     """Values by key of a result, with its protocol, reference rows and the costs of training."""
     made_by: str
@@ -107,7 +105,7 @@ def _rows_of_rooms(run: Run, rooms: str, found: dict[Variant, dict[str, Any]]) -
 
     for variant, scores in found.items():
         # A result names the distribution of its rooms, with the mark of the version that wrote it.
-        yield row(variant, scores["protocol"].get("latents", AS_GIVEN).split(",")[0], scores)
+        yield row(variant, scores["protocol"]["latents"].split(",")[0], scores)
     first, last = next(iter(found.values())), list(found)[-1]
     if decoded := first.get("decoded_rooms"):
         # The last variant decodes latents; a sampler, which decodes no room, would come first.
@@ -132,12 +130,10 @@ def _rows_of_views(run: Run, rooms: str, found: dict[Variant, dict[str, Any]]) -
 
 
 def costs_of(run: Run) -> dict[str, int | float | None]:
-    """Costs of training: `cpu_s`, `steps` and `parameters`; empty for scenes.
+    """Costs of training: `cpu_s`, `steps` and `parameters`.
 
     CPU seconds are None if they are unknown, since training was killed or started by hand.
     """
-    if run.scenes is not None:
-        return {}
     steps = 0
     for final in (run.folder / "run").glob("*/final.ckpt"):
         saved = read_checkpoint(final)
@@ -237,8 +233,7 @@ def _caption(rows: Sequence[Row], form: Form) -> str:
     for row in rows:
         titles.setdefault(row.made_by, {})[f"'{row.title}'"] = None
     parts = (f"of {said}: {', '.join(named) or 'none'}" for said, named in titles.items())
-    seeds = sorted({row.seed for row in rows if row.seed is not None})
-    told = ", ".join(map(str, seeds)) or "none"
+    told = ", ".join(map(str, sorted({row.seed for row in rows})))
     return f"Rows {'; '.join(parts)}. {form.say(rows[0].scores)}; seeds {told}."
 
 

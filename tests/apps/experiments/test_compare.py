@@ -1,7 +1,6 @@
 """Comparisons: what is refused, which runs there are, and how a stopped one is continued."""
 
 import errno
-import json
 import shutil
 from functools import partial
 from operator import attrgetter
@@ -42,10 +41,6 @@ def written(toy_shards, tmp_path):
         ("key", {"seed": [0]}),
         ("seeds", {"seeds": [1, 1]}),
         ("title_twice", {"methods": {"a": {}, "b": {}}}),
-        ("rooms_of_scenes", {"methods": {"a": {"title": "A", "scenes": {"attic": "b"}}}}),
-        ("scenes_and_config",
-         {"methods": {"a": {"title": "A", "scenes": {"toy": "b"}, "config": "c.yaml"}}}),
-        ("scenes_title", {"methods": {"a": {"scenes": {"toy": "b"}}}}),
         ("baseline_title", {"methods": {"a": {"config": "baselines/gan.yaml"}}}),
         ("rooms_of_set", {"methods": {"a": {"title": "A", "set": {"attic": []}}}}),
         ("key_of_set", {"methods": {"a": {"title": "A", "set": {"toy": ["model.widht=3"]}}}}),
@@ -54,10 +49,8 @@ def written(toy_shards, tmp_path):
         ("task_type", {"task": ["a"]}),
         ("fits", {"task": "single_views", "fits": ["guess"]}),
         ("key_of_task", {"task": "new_rooms", "views": 2}),
-        ("views_of_scenes",
-         {"task": "single_views", "methods": {"a": {"title": "A", "scenes": {"toy": "b"}}}}),
     ],
-)  # fmt: skip
+)
 def test_a_wrong_comparison_is_refused_before_anything_runs(written, tmp_path, name, changes):
     path = written(**changes)
     with refused(f"apps/compare_{name}", ConfigError, tmp=tmp_path):
@@ -98,13 +91,11 @@ def test_rooms_change_the_config_that_methods_share(written, tmp_path):
         "lstm": {**METHODS["lstm"], "set": {"more": ["layout.epochs=8"]}},
         "gan": {"title": "GAN", "config": str(tmp_path / "gan.yaml")},
     }
-    theirs = {"theirs": {"title": "Theirs", "scenes": {"more": "theirs"}}}
-    comparison = load_comparison(written(rooms=kinds, methods=trained | theirs))
+    comparison = load_comparison(written(rooms=kinds, methods=trained))
     runs = {(run.rooms, run.method): run for run in runs_of(comparison, Path())}
     configs = {key: run.run_config for key, run in runs.items()}
     assert {key: config.layout.epochs for key, config in configs.items() if key[1] != "gan"} == {
         ("toy", "paper"): 1, ("toy", "lstm"): 1, ("more", "paper"): 9, ("more", "lstm"): 8,
-        ("more", "theirs"): 9,
     }  # fmt: skip
     assert {configs["more", name].model.max_objects for name in trained} == {2}
     assert {configs["more", name].data.shards for name in trained} == {"large"}
@@ -255,29 +246,6 @@ def test_a_stopped_comparison_says_how_to_continue(command, written, calls, tmp_
     assert status == 130, errors
     assert errors.endswith("Stopped. Run the same command again to continue.\n")
     assert calls.names == ["fit"] and not (tmp_path / "out" / "table.md").exists()
-
-
-def test_existing_scenes_are_a_row_and_evaluated_again_when_they_change(
-    begun, toy_shards, scenes, tmp_path, monkeypatch
-):
-    scenes = shutil.copytree(scenes, tmp_path / "given", ignore=shutil.ignore_patterns("scores*"))
-    methods = {"paper": {}, "theirs": {"title": "Theirs", "scenes": {"toy": str(scenes)}}}
-    done = again(begun, tmp_path, "theirs", methods=methods)
-    assert done.failures == [] and done.left_out == []
-    folder = tmp_path / "out" / "toy" / "theirs"
-    words = json.loads((folder / "steps.json").read_text())["scores"]["arguments"]
-    assert " ".join(words).startswith(f"eval-fid --scenes {scenes} --shards {toy_shards} --out")
-    assert not (folder / "run").exists() and not (scenes / "scores.json").exists()
-    (line,) = (x for x in done.table.read_text().splitlines() if x.startswith("| Theirs "))
-    assert line.split(" | ")[1] == "as given" and line.endswith("| – | – | – |")
-    assert line.split(" | ")[2:] != ["–"] * len(line.split(" | ")[2:])
-    calls = Calls()
-    monkeypatch.setattr(commands, "call", calls)
-    again(begun, tmp_path, "theirs", methods=methods)
-    assert calls.names == []
-    (scenes / "room_0.json").write_text((scenes / "room_1.json").read_text() + " ")
-    again(begun, tmp_path, "theirs", methods=methods)
-    assert calls.names == ["eval-fid"]
 
 
 def test_a_fit_of_single_views_is_scored_and_tabulated(toy_run, toy_shards, tmp_path, monkeypatch):
