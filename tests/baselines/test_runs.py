@@ -6,8 +6,10 @@ from interrupting import CPU, interrupted
 from toy_metrics import without_classifiers
 
 from sceneprior.apps.config import load_any_run
-from sceneprior.apps.experiments.evaluate import evaluate_run, report_run
+from sceneprior.apps.experiments.evaluate import evaluate_run
+from sceneprior.apps.experiments.report import report_run
 from sceneprior.apps.sample import sample_rooms
+from sceneprior.core.files import write_json
 from sceneprior.evaluation.room_sets import without_void
 from sceneprior.evaluation.synthesis import EvalOptions
 from sceneprior.training.checkpoints import read_checkpoint
@@ -45,13 +47,14 @@ def test_an_interrupted_and_resumed_run_reaches_the_same_weights(
 @pytest.mark.parametrize("method", ("gan", "atiss"))
 def test_a_run_is_evaluated_and_reported_by_its_new_rooms_alone(baseline_run, method, tmp_path):
     run, options = baseline_run(method), EvalOptions(resamples=5)
-    scores = evaluate_run(run, 4, options, tmp_path / "scores.json")
+    scores = evaluate_run(run, 4, options)
+    write_json(tmp_path / "scores.json", scores)
     assert scores["protocol"]["stage"] == method
     assert scores["protocol"]["latents"] == ("paper" if method == "gan" else "its own")
     rooms = [without_void(room) for room in sample_rooms(load_any_run(run), 4, 0)]
     assert "box_iou_3d" not in scores
     assert scores["mean_objects"] == sum(len(room.objects) for room in rooms) / 4
-    report_run(run, tmp_path / "scores.json", tmp_path / "page.html", 0, ())
+    report_run(run, tmp_path / "scores.json", tmp_path / "page.html", 0)
     page = (tmp_path / "page.html").read_text()
     assert "New rooms beside real ones" in page and "Interpolation on the sphere" not in page
     if method != "gan":

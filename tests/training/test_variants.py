@@ -9,7 +9,7 @@ from tiny_runs import tiny_config, tiny_lifted
 
 from sceneprior.apps.config import load_run
 from sceneprior.apps.decoders import AnyPaperModel
-from sceneprior.apps.experiments.evaluate import (
+from sceneprior.apps.experiments.report import (
     UNFOLDING_STEPS,
     read_curves,
     unfold,

@@ -137,6 +137,7 @@ def _score(
 ) -> None:
     """Score the rooms of a run, or a folder of scenes; with `use`, by metrics of use as well."""
     from sceneprior.apps.experiments.evaluate import evaluate_folder, evaluate_run
+    from sceneprior.core.files import write_json
     from sceneprior.evaluation.score_table import print_scores
 
     if run is not None and scenes is not None:
@@ -149,7 +150,7 @@ def _score(
             options.result_file(run, out, "scores.json"),
             count or (MEASURED if use else GENERATED),
         )
-        found = evaluate_run(run, count, protocol, target, shards, distribution, use, asked)
+        found = evaluate_run(run, count, protocol, shards, distribution, use, asked)
     elif scenes is not None:
         if distribution is not None:
             raise InputError("--distribution belongs to --run; scenes are evaluated as they are.")
@@ -158,11 +159,12 @@ def _score(
         if use is None and shards is None:
             raise InputError("--scenes needs --shards: the folder with the test rooms.")
         target = options.checked_target(out or scenes / "scores.json")
-        found = evaluate_folder(scenes, count, protocol, target, shards, use)
+        found = evaluate_folder(scenes, count, protocol, shards, use)
     else:
         with_shards = "" if use else " with --shards SHARDS"
         raise InputError(
             f"There is nothing to evaluate; give --run RUN, or --scenes DIR{with_shards}."
         )
+    write_json(target, found)
     print_scores(found)
     typer.echo(f"Wrote {target}")

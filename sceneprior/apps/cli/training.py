@@ -62,24 +62,20 @@ def report(
         Path | None, typer.Option(help="HTML file (default: report.html in RUN or SCENES).")
     ] = None,
     seed: options.Seed = 0,
-    command: Annotated[
-        list[str] | None, typer.Option(help="Command to list on the page; repeatable.")
-    ] = None,
 ) -> None:
     """Write one self-contained HTML page of a run or of scenes: inputs, curves, rooms, scores."""
-    from sceneprior.apps.experiments.evaluate import report_folder, report_run
+    from sceneprior.apps.experiments.report import report_folder, report_run
 
-    commands = tuple(command or ())
     if run is not None and (scenes, shards) == (None, None):
         target = out or run / "report.html"
         if run.is_dir():
             options.checked_target(target)
-        report_run(run, scores, target, seed, commands)
+        report_run(run, scores, target, seed)
     elif scenes is not None and shards is not None and run is None:
         if seed != 0:
             raise InputError("--seed belongs to --run; scenes are shown as they are.")
         target = options.checked_target(out or scenes / "report.html")
-        report_folder(scenes, shards, scores, target, commands)
+        report_folder(scenes, shards, scores, target)
     else:
         raise InputError(
             "Say what to report on: either --run RUN, or --scenes DIR --shards SHARDS."
@@ -117,7 +113,8 @@ def compare(
 ) -> None:
     """Train and evaluate methods on the same rooms, and tabulate them; run again to continue."""
     from sceneprior.apps.experiments.compare import compare as run_comparison
-    from sceneprior.apps.experiments.runs import load_comparison, part_of
+    from sceneprior.apps.experiments.compare import part_of
+    from sceneprior.apps.experiments.comparison import load_comparison
 
     comparison = load_comparison(config)
     part = part_of(comparison, out, methods, rooms, seeds)
@@ -147,7 +144,7 @@ def demo(
     count: Annotated[int, typer.Option(min=2, help="Number of rooms to generate.")] = 200,
 ) -> None:
     """Run the whole pipeline on procedural homes: shards, training, new rooms, scores, a page."""
-    from sceneprior.apps.experiments.demo import run_demo
+    from sceneprior.apps.experiments.commands import run_demo
 
     with _stopped_by_ctrl_c():
         run_demo(out, config, rooms, count, _main)

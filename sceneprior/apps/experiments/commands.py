@@ -1,7 +1,8 @@
 """Runs `sceneprior` commands one after the other, so that they can be stopped and continued.
 
 The `steps.json` of a folder records each command, its costs and whether it finished, so that a
-reader who doubts a number can run the command again.
+reader who doubts a number can run the command again. The demo is such a folder: the whole pipeline
+on procedural homes, from homes to a page that lists the commands.
 """
 
 import contextlib
@@ -14,7 +15,7 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
@@ -22,6 +23,7 @@ from typing import Any
 
 import torch
 
+from sceneprior.apps.config import load_config
 from sceneprior.apps.failures import sentence_of
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import only_writer, read_json, write_json
@@ -67,18 +69,11 @@ def running_commands(out: Path) -> Iterator[None]:
         yield
 
 
-def run_command(
-    main: Main,
-    command: Command,
-    folder: Path,
-    log: Path | None = None,
-    unshown: Sequence[str] = (),
-) -> None:
+def run_command(main: Main, command: Command, folder: Path, log: Path | None = None) -> None:
     """Run a command, record it in `folder`, and drop the records of later ones, now out of date.
 
     Args:
         log: File for the command's output; None prints it on the terminal.
-        unshown: Further arguments, which are neither printed nor recorded.
 
     Raises:
         InputError: the command failed.
@@ -94,7 +89,7 @@ def run_command(
     write_json(folder / "steps.json", {**earlier, command.name: entry})
     start, finished = costs(), False
     try:
-        call(main, [*command.arguments, *unshown], log)
+        call(main, command.arguments, log)
         finished = True
     finally:
         end = costs()
@@ -160,3 +155,82 @@ def read_result(path: Path) -> dict[str, Any]:
         raise InputError(
             f"{path} is damaged; delete it and run the same command again: training is kept."
         ) from None
+
+
+def finished_commands(folder: Path) -> list[str]:
+    """The finished commands of `steps.json`, as they are typed."""
+    journal = read_journal(folder).values()
+    return [
+        f"sceneprior {shlex.join(entry['arguments'])}" for entry in journal if entry.get("finished")
+    ]
+
+
+# -- The demo --------------------------------------------------------------------------------------
+
+
+def run_demo(out: Path, config: str, rooms: int, count: int, main: Main) -> None:
+    """Run every unfinished command, then add time and memory to the scores.
+
+    Ctrl-C, SIGTERM and SIGHUP raise KeyboardInterrupt; a second, identical call continues.
+    """
+    with running_commands(out):
+        for command in demo_commands(out, config, rooms, count):
+            if is_done(command, out):
+                took = read_journal(out)[command.name]["wall_s"]
+                seconds = "" if took is None else f", {took:.0f} s"
+                print(f"{command.name}: done before{seconds}", file=sys.stderr)
+                continue
+            if command.name == "report":
+                _add_costs(out)
+            try:
+                run_command(main, command, out)
+            except InputError:
+                raise InputError(
+                    f"The demo stopped at '{command.name}'; fix the error and run it again."
+                ) from None
+        _add_costs(out)
+
+
+def demo_commands(out: Path, config: str, rooms: int, count: int) -> list[Command]:
+    """The demo's commands in order; a command is repeated if its arguments or the contents of
+    `config` change."""
+    homes, shards, run, scenes = (str(out / name) for name in ("homes", "shards", "run", "scenes"))
+    scores, page = str(out / "scores.json"), str(out / "report.html")
+    words = {
+        "homes": ["make-homes", homes, "--rooms", str(rooms), "--seed", "0"],
+        "shards": [
+            "prep-front", "--front", f"{homes}/3D-FRONT", "--future", f"{homes}/3D-FUTURE-model",
+            "--splits", f"{homes}/splits/bedroom.csv", "--recipe", "bedroom",
+            "--out", shards,
+        ],
+        "fit": [
+            "fit", "--config", config, "--run", run, "--set", f"data.shards={shards}", "--resume",
+        ],
+        "scenes": ["synthesize", "--run", run, "-n", "16", "--out", scenes, "--overwrite"],
+        "scores": ["eval-fid", "--run", run, "-n", str(count), "--out", scores],
+        "report": ["report", "--run", run, "--scores", scores, "--out", page],
+    }  # fmt: skip
+    settings = load_config(config)
+    last = settings.stages()[-1].name
+    results = {
+        "homes": "homes", "shards": "shards/index.json", "fit": f"run/{last}/final.ckpt",
+        "scenes": "scenes/overview.png", "scores": "scores.json", "report": "report.html",
+    }  # fmt: skip
+    continues = {"shards": out / "shards", "fit": out / "run"}
+    depends_on = words | {"fit": [*words["fit"], settings.model_dump_json()]}
+    return [
+        Command(name, arguments, out / results[name], depends_on[name], continues.get(name))
+        for name, arguments in words.items()
+    ]
+
+
+def _add_costs(out: Path) -> None:
+    """Add the time and memory of all commands to scores.json, unless one was killed."""
+    noted = {name: entry for name, entry in read_journal(out).items() if entry.get("finished")}
+    scores = read_result(out / "scores.json")
+    seconds = {name: entry["wall_s"] for name, entry in noted.items()}
+    if None not in seconds.values():
+        scores["seconds"] = round(sum(seconds.values()), 1)
+        scores["peak_memory_gib"] = round(max(e["peak_memory_gib"] for e in noted.values()), 2)
+        scores["steps"] = {name: round(took, 1) for name, took in seconds.items()}
+    write_json(out / "scores.json", scores)

@@ -16,16 +16,45 @@ from sceneprior.apps.experiments.commands import (
     run_command,
     running_commands,
 )
-from sceneprior.apps.experiments.comparison import Comparison, RoomComparison, ViewComparison
-from sceneprior.apps.experiments.runs import Run, runs_of, shards_of, variants_of
+from sceneprior.apps.experiments.comparison import (
+    Comparison,
+    Run,
+    ViewComparison,
+    runs_of,
+    shards_of,
+    variants_of,
+)
 from sceneprior.apps.experiments.table import write_tables
 from sceneprior.core.errors import InputError
-from sceneprior.core.ground_truth import known_in_3d
-from sceneprior.core.shards import iterate_rooms
 from sceneprior.evaluation.features import check_inception
 
-OF_SHARDS = "shards"
-"""Value of `cad_models` that selects the CAD models of the training rooms."""
+
+def part_of(
+    comparison: Comparison,
+    out: Path,
+    methods: str | None = None,
+    rooms: str | None = None,
+    seeds: str | None = None,
+) -> list[Run]:
+    """The runs of the given methods, kinds of rooms and seeds, each as `a,b`; None means all."""
+    runs = runs_of(comparison, out)
+    for what, key, given, known in (
+        ("method", "method", methods, comparison.methods),
+        ("kind of rooms", "rooms", rooms, comparison.rooms),
+        ("seed", "seed", seeds, map(str, comparison.seeds)),
+    ):
+        names = list(known)
+        asked = [name.strip() for name in (",".join(names) if given is None else given).split(",")]
+        asked = [name for name in asked if name]
+        for name in asked:
+            if name not in names:
+                raise InputError(
+                    f"No {what} '{name}' in this comparison; it has {', '.join(names)}."
+                )
+        if not asked:
+            raise InputError(f"No {what} was named; the comparison has {', '.join(names)}.")
+        runs = [run for run in runs if str(getattr(run, key)) in asked]
+    return runs
 
 
 class Compared(NamedTuple):
@@ -59,16 +88,16 @@ def compare(
     """
     if inception is not None:
         check_inception(inception)
-    count = cache(lambda rooms: count_of(comparison, rooms))
+    shared = cache(lambda rooms: comparison.shared_options(shards_of(comparison, rooms), inception))
     for run in part:
-        count(run.rooms)  # unusable shards raise here, before anything is trained
+        shared(run.rooms)  # unusable shards raise here, before anything is trained
     done, failures, left_out = list[Run](), list[str](), list[str]()
     with running_commands(out):
         for run in runs_of(comparison, out):
             evaluated = (run.folder / "scores.json").is_file()
             if run not in part and not evaluated:
                 continue
-            commands = commands_of(comparison, run, count(run.rooms), inception, accelerator)
+            commands = commands_of(comparison, run, shared(run.rooms), accelerator)
             if run in part and (failure := _finish(run, commands, main)):
                 failures.append(f"{run.title}: {failure}")
             elif keeps_settings(run) and all(is_done(each, run.folder) for each in commands):
@@ -115,59 +144,11 @@ def keeps_settings(run: Run) -> bool:
     return kept.model_dump(exclude={"sampling"}) == wanted.model_dump(exclude={"sampling"})
 
 
-def count_of(comparison: Comparison, rooms: str) -> int | None:
-    """Number of rooms that each run generates, or of test rooms whose views each run reconstructs.
-
-    None means all test rooms. Raises InputError if single views are compared and the test rooms
-    have no 3D ground truth.
-    """
-    shards = shards_of(comparison, rooms)
-    if isinstance(comparison, ViewComparison):
-        if not known_in_3d(shards, "test"):
-            raise InputError(
-                f"Single views are compared with true rooms, and the 'test' rooms of {shards} are "
-                "missing or not known in 3D; give shards of prep-front or prep-scannet."
-            )
-        return comparison.count
-    assert isinstance(comparison, RoomComparison), "one of TASKS"
-    return comparison.count or sum(1 for _ in iterate_rooms(shards, "train"))
-
-
 def commands_of(
-    comparison: Comparison,
-    run: Run,
-    count: int | None,
-    inception: Path | None = None,
-    accelerator: str = "auto",
+    comparison: Comparison, run: Run, shared: list[str], accelerator: str = "auto"
 ) -> list[Command]:
-    """The commands of a run: `fit`, and for each of its variants `eval-fid` or `eval-svr`, which
-    depends on the settings that all rows of a table share."""
-    shards = str(shards_of(comparison, run.rooms))
-    source = ["--run", str(run.folder / "run")]
-    shared = ["--seed", str(comparison.sampling_seed)]
-    if isinstance(comparison, ViewComparison):
-        command, option = "eval-svr", "--fit"
-        source += ["--shards", shards]
-        shared = ["--split", "test", "--views", str(comparison.views), *shared]
-        if count is not None:
-            shared += ["--limit", str(count)]
-        if (models := comparison.cad_models) is not None:
-            shared += ["--models", shards if models == OF_SHARDS else models]
-    else:
-        command, option = "eval-fid", "--distribution"
-        # Some methods decode meshes, others boxes only; --boxes compares the boxes of all methods.
-        shared = ["-n", str(count), *shared, "--boxes"]
-        if inception is not None:
-            shared += ["--inception", str(inception)]
-    commands = [_fit(run, accelerator)]
-    for variant in variants_of(comparison, run):
-        asked = shared if variant.name is None else [*shared, option, variant.name]
-        words = [command, *source, "--out", str(variant.result), *asked]
-        commands.append(Command(variant.result.stem, words, variant.result, asked))
-    return commands
-
-
-def _fit(run: Run, accelerator: str) -> Command:
+    """The commands of a run: `fit`, and for each of its variants the one that scores it, which
+    depends on `shared` (`shared_options`)."""
     folder = run.folder / "run"
     settings = [word for setting in run.settings for word in ("--set", setting)]
     words = ["fit", "--config", run.config, "--run", str(folder), *settings, "--logger", "csv"]
@@ -175,4 +156,12 @@ def _fit(run: Run, accelerator: str) -> Command:
     words += ["--accelerator", accelerator, "--devices", "1", "--resume"]
     result = folder / run.run_config.stage_names[-1] / "final.ckpt"
     # It depends on nothing, because changed settings never repeat it: `keeps_settings` refuses.
-    return Command("fit", words, result, depends_on=[], continues=folder / "config.yaml")
+    commands = [Command("fit", words, result, depends_on=[], continues=folder / "config.yaml")]
+    source = ["--run", str(folder)]
+    if isinstance(comparison, ViewComparison):
+        source += ["--shards", str(shards_of(comparison, run.rooms))]
+    for variant in variants_of(comparison, run):
+        asked = shared if variant.name is None else [*shared, comparison.option, variant.name]
+        words = [comparison.command, *source, "--out", str(variant.result), *asked]
+        commands.append(Command(variant.result.stem, words, variant.result, asked))
+    return commands

@@ -1,53 +1,60 @@
-"""Evaluate a run, or a folder of the user's scenes, and write their report page."""
+"""Evaluate a run, or a folder of the user's scenes, by shards with or without 3D ground truth."""
 
-import csv
-import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from jaxtyping import Int
 
-from sceneprior.apps.config import load_any_run, run_config
-from sceneprior.apps.experiments.evaluate_views import (
-    evaluate_from_views,
-    mask_scores,
-)
-from sceneprior.apps.experiments.runs import GIVEN, made_by_run
-from sceneprior.apps.sample import sample_rooms
+from sceneprior.apps.api import load
+from sceneprior.core.classes import VOID, label_set
+from sceneprior.core.dataset import ViewDataset, allowed_views
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import write_json
 from sceneprior.core.ground_truth import known_in_3d, reference_scenes
 from sceneprior.core.scene import Scene
-from sceneprior.core.shards import list_shards
-from sceneprior.evaluation.metrics.contents import reconstruction_scores
-from sceneprior.evaluation.report import ROOMS_SHOWN, write_report
+from sceneprior.core.shards import iterate_rooms, list_shards
+from sceneprior.evaluation.metric import METHOD, Estimate, emptiness, mean_of_rooms, resample_counts
+from sceneprior.evaluation.metrics import METRICS
+from sceneprior.evaluation.metrics.contents import (
+    TYPE_CLASSES,
+    category_kl,
+    class_counts,
+    common_label_set,
+    reconstruction_scores,
+)
+from sceneprior.evaluation.metrics.overlaps import room_overlaps
 from sceneprior.evaluation.room_sets import seeded_rows
-from sceneprior.evaluation.synthesis import FORMAT, EvalOptions, evaluate_synthesis
+from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis, result_of
 from sceneprior.evaluation.use import UseOptions, evaluate_use
+from sceneprior.paper.config import PaperConfig
+from sceneprior.paper.fit_image import decode_images, view_loss
 from sceneprior.paper.prior import TrainedPrior
-from sceneprior.paper.sampling import decode_latents, decode_training_rooms, marked
+from sceneprior.paper.sampling import decode_training_rooms, marked
 from sceneprior.render.scene_files import load_scene_folder
-from sceneprior.training.method import Trained, TrainedSampler
+from sceneprior.training.method import Trained
 
-UNFOLDING_STEPS = 7
-CURVES = (
-    "loss", "class", "box", "completeness", "frustum", "mask", "mask_iou", "shape", "latents",
-    "discriminator", "objects", "existence", "position", "size", "kl",
-)  # fmt: skip
+VIEWS = 4
+"""Number of views per training room in which decoded masks are compared."""
+_BATCH = 8
+_NOTE = (
+    "The rooms of these shards are known from views alone: objects are counted as they appear in "
+    "the views, and metrics that need 3D ground truth are left out."
+)
 
 
 def evaluate_run(
     run: Path | str,
     count: int,
     options: EvalOptions,
-    out: Path,
     shards: Path | None = None,
     distribution: str | None = None,
     use: UseOptions | None = None,
     asked: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Score generated rooms against test rooms (`_scores`), and write the scores.
+    """Score generated rooms against test rooms (`_scores`).
 
     The options' seed also draws the latents; `shards` and `distribution` default to the run's.
 
@@ -55,29 +62,21 @@ def evaluate_run(
         use: Also compute metrics of use; without shards, compute only these.
         asked: Request for the rooms, as arguments of `Prior.sample`; only with `use`.
     """
-    trained = load_any_run(run)
-    known: Path | None = shards or Path(trained.config.data.shards)
-    if shards is None and known is not None and not known.is_dir():
-        if use is None:
-            raise InputError(
-                f"{run} was trained on shards '{known}', which do not exist; name the shards to "
-                "compare with: --shards."
-            )
-        known = None
-
-    def generate() -> list[Scene]:
-        if asked:
-            from sceneprior.apps.api import load
-
-            return load(run).sample(count, options.seed, distribution, **asked)
-        return sample_rooms(trained, count, options.seed, distribution)
-
-    scores = _scores(generate, known, options, use, trained)
+    prior = load(run)
+    trained, own = prior.trained, Path(prior.trained.config.data.shards)
+    if shards is None and own.is_dir():
+        shards = own
+    elif shards is None and use is None:
+        raise InputError(
+            f"{run} was trained on shards '{own}', which do not exist; name the shards to compare "
+            "with: --shards."
+        )
+    generate = partial(prior.sample, count, options.seed, distribution, **(asked or {}))
+    scores = _scores(generate, shards, options, use, trained)
     latents = "its own"
     if isinstance(trained, TrainedPrior):
         latents = marked(distribution or trained.distribution)
     scores["protocol"] |= {"run": Path(run).name, "stage": trained.stage, "latents": latents}
-    write_json(out, scores)
     return scores
 
 
@@ -85,12 +84,11 @@ def evaluate_folder(
     folder: Path,
     count: int | None,
     options: EvalOptions,
-    out: Path,
     shards: Path | None,
     use: UseOptions | None = None,
 ) -> dict[str, Any]:
-    """Score `count` of the user's scenes (None: all), of any method, against test rooms, and write
-    the scores; with `use`, metrics of use are added and `shards` are optional."""
+    """Score `count` of the user's scenes (None: all), of any method, against test rooms; with
+    `use`, metrics of use are added and `shards` are optional."""
     scenes = load_scene_folder(folder)
     if count is not None and count > len(scenes):
         raise InputError(
@@ -100,7 +98,6 @@ def evaluate_folder(
     rows = seeded_rows(len(scenes), count or len(scenes), options.seed)
     scores = _scores(lambda: [scenes[row] for row in rows], shards, options, use)
     scores["protocol"] |= {"scenes": folder.resolve().name, "n_scenes_available": len(scenes)}
-    write_json(out, scores)
     return scores
 
 
@@ -140,6 +137,9 @@ def _scores(
     return scores
 
 
+# -- Training rooms, decoded -----------------------------------------------------------------------
+
+
 def decoded_and_true(
     trained: Trained, shards: Path, meshes: bool = False
 ) -> list[tuple[Scene, Scene]]:
@@ -161,101 +161,101 @@ def decoded_and_true(
     return [(decoded[name], truth[name]) for name in truth if name in decoded]
 
 
-def report_run(
-    run: Path, scores: Path | None, out: Path, seed: int, commands: tuple[str, ...]
-) -> None:
-    """Write the report page of a run, without comparisons if the rooms have no 3D ground truth."""
-    trained = load_any_run(run)
-    config, shards = trained.config, Path(trained.config.data.shards)
-    found = read_scores(scores, run, shards, f"--run {run}")
-    decoded: list[tuple[Scene, Scene]] = []
-    unfolding: list[Scene] = []
-    if isinstance(trained, TrainedPrior) and trained.remembers_rooms:
-        if known_in_3d(shards, "train"):
-            decoded = decoded_and_true(trained, shards, meshes=True)
-        unfolding = unfold(trained)
-    method = made_by_run(config, trained.distribution)[0] or f"the method {config.method}"
-    made_by = f"{method}, which learns from {config.learns_from}"
-    if isinstance(trained, TrainedPrior):
-        made_by += f"; rooms drawn by: {marked(trained.distribution)}"
-    write_report(
-        out,
-        title=f"New rooms from a prior learnt from {config.learns_from}",
-        source=f"run {run.resolve().name}",
-        made_by=made_by,
-        shards=shards,
-        views=not isinstance(trained, TrainedSampler),
-        generated=sample_rooms(trained, ROOMS_SHOWN, seed),
-        scores=found,
-        commands=commands,
-        curves=read_curves(run),
-        decoded=decoded,
-        unfolding=unfolding,
-    )
+@torch.no_grad()
+def mask_scores(trained: TrainedPrior, shards: Path) -> dict[str, float]:
+    """Mean soft IoU of the masks of decoded training rooms with the observed masks, as in training.
 
-
-def report_folder(
-    folder: Path, shards: Path, scores: Path | None, out: Path, commands: tuple[str, ...]
-) -> None:
-    """Write the report page of the user's scenes, made by any method, without the parts that need
-    a run."""
-    scenes = load_scene_folder(folder)
-    write_report(
-        out,
-        title="Rooms beside real ones",
-        source=f"scenes {folder.resolve().name}",
-        made_by=GIVEN,
-        shards=shards,
-        generated=scenes[:ROOMS_SHOWN],
-        scores=read_scores(scores, folder, shards, f"--scenes {folder} --shards {shards}"),
-        commands=commands,
-    )
-
-
-def read_scores(path: Path | None, folder: Path, shards: Path, evaluated: str) -> dict[str, Any]:
-    """Read the scores that `eval-fid` wrote to a file.
-
-    Args:
-        path: The file; None reads `scores.json` of `folder`, which may be missing if the rooms have
-            no 3D ground truth.
-        evaluated: Arguments of the `eval-fid` command that writes the file, for the error message.
+    The key is `mask_iou_held_out` if `data.view_fraction` holds views of every room out of
+    training; the IoU is then computed in such views. Otherwise it is computed in training views,
+    and the key is `mask_iou_training_views`. Empty for runs that decode no meshes: those of methods
+    other than `paper`, and those before the shape stage.
     """
-    if path is None:
-        path = folder / "scores.json"
-        if not path.exists() and not known_in_3d(shards, "test"):
-            return {}
-    try:
-        found = json.loads(path.read_text())
-        if not isinstance(found, dict) or found.get("format") != FORMAT:
-            raise ValueError("another file")
-    except (OSError, ValueError) as error:
+    config = trained.config
+    if not isinstance(config, PaperConfig) or trained.stage == "layout":
+        return {}
+    data = config.data
+    fewest = min(len(shard.read_room(r).visible) for shard, r in iterate_rooms(shards, "train"))
+    held_out = len(allowed_views(0, 0, fewest, data.view_fraction)) < fewest
+    rooms = ViewDataset(
+        shards, "train", views_per_room=VIEWS, rotations=data.rotations, seed=config.seed,
+        mask_step=data.mask_step, view_fraction=data.view_fraction, held_out=held_out,
+    )  # fmt: skip
+    if set(rooms.room_ids) != set(trained.room_ids):
         raise InputError(
-            f"{path} holds no scores ({error}); write them with `sceneprior eval-fid {evaluated}`."
-        ) from None
-    return found
+            f"{shards} does not hold the training rooms of this run; give the shards it was "
+            "trained on with --shards."
+        )
+    total, pairs = 0.0, 0
+    rows = range(0, len(rooms), rooms.rotations)
+    for start in range(0, len(rows), _BATCH):
+        views = rooms.__getitems__([(row, 0) for row in rows[start : start + _BATCH]])
+        points = trained.prior.latent_space(trained.logits[views.room_index])
+        found = view_loss(trained, decode_images(trained, points, views), views)
+        seen = views.visible.sum(dim=(1, 2))
+        total, pairs = total + float((found.mask_iou * seen).sum()), pairs + int(seen.sum())
+    key = "mask_iou_held_out" if held_out else "mask_iou_training_views"
+    return {key: total / pairs} if pairs else {}
 
 
-def unfold(trained: TrainedPrior) -> list[Scene]:
-    """Rooms along the geodesic between two distant training rooms, from one latent to the other."""
-    space = trained.prior.latent_space
-    z = space(trained.logits)
-    far = z[(z - z[0]).norm(dim=-1).argmax()]
-    names = [f"step_{step}" for step in range(UNFOLDING_STEPS)]
-    along = torch.linspace(0, 1, UNFOLDING_STEPS)
-    return decode_latents(trained, space.between(z[0], far, along), names)
+# -- Rooms without 3D ground truth, such as posed captures -----------------------------------------
 
 
-def read_curves(run: Path) -> dict[str, list[tuple[int, float]]]:
-    """Loss curves of every stage from its metrics.csv, as `stage/term` -> (epochs, values)."""
-    curves: dict[str, list[tuple[int, float]]] = {}
-    for stage in run_config(run).stage_names:
-        path = run / stage / "metrics.csv"
-        if not path.is_file():
-            continue
-        with path.open(newline="") as file:
-            for row in csv.DictReader(file):
-                for term in CURVES:
-                    if row.get(f"train/{term}"):
-                        point = (int(row["epoch"]), float(row[f"train/{term}"]))
-                        curves.setdefault(f"{stage}/{term}", []).append(point)
-    return curves
+def evaluate_from_views(
+    generated: Sequence[Scene], shards: Path, options: EvalOptions
+) -> dict[str, Any]:
+    """Compute the metrics that need no 3D ground truth, in the format of `evaluate_synthesis`.
+
+    The result holds the generated rooms' scores by key of `METRICS`, the real training rooms'
+    scores under `train_rooms`, and the test rooms' scores under `<key>_test`.
+    """
+    names = common_label_set(generated)
+    rooms = {split: _counted(shards, split, names) for split in ("train", options.split)}
+    counts = {
+        "generated": class_counts(generated), "train_rooms": rooms["train"],
+        "test": rooms[options.split],
+    }  # fmt: skip
+    draws = {
+        name: resample_counts(len(table), options.resamples, (options.seed, number))
+        for number, (name, table) in enumerate(counts.items())
+    }
+    columns: dict[str, dict[str, Estimate]] = {}
+    for name, table in counts.items():
+        found = {"mean_objects": mean_of_rooms(table.sum(axis=1), draws[name])}
+        if wanted := TYPE_CLASSES.get(names):
+            held = table[:, [label_set(names).index(label) for label in wanted]].any(axis=1)
+            found["type_share"] = mean_of_rooms(held.astype(float), draws[name], 1.0)
+        if name != "test":
+            found["category_kl"] = category_kl(table, counts["test"], draws[name], draws["test"])
+        columns[name] = found
+    volumes = [room_overlaps(scene).volumes_m3.sum() for scene in generated]
+    columns["generated"]["overlap_volume_m3"] = mean_of_rooms(volumes, draws["generated"])
+    measured = columns["generated"]
+    return result_of(columns) | {
+        "note": " ".join(filter(None, (emptiness(generated), _NOTE))),
+        "protocol": {
+            "label_set": names,
+            "shards": Path(shards).resolve().name,
+            "split": options.split,
+            **{f"n_{name}": len(table) for name, table in counts.items()},
+            "seed": options.seed,
+            "resamples": options.resamples,
+            "intervals": METHOD,
+            "left_out": {m.key: "rooms in 3D" for m in METRICS if m.key not in measured},
+        },
+    }
+
+
+def _counted(shards: Path, split: str, names: str) -> Int[np.ndarray, "rooms classes"]:
+    """Number of tracked objects of each class in each room, void left out."""
+    tables = []
+    for shard, room_id in iterate_rooms(shards, split):
+        if shard.label_set != names:
+            raise InputError(
+                f"Scores compare scenes of one label set, but the scenes have '{names}' and "
+                f"{shards} has '{shard.label_set}'."
+            )
+        labels = shard.read_room(room_id).object_class
+        tables.append(np.bincount(labels, minlength=len(label_set(names))))
+    table = np.stack(tables).astype(np.int64)
+    table[:, VOID] = 0
+    return table

@@ -10,14 +10,24 @@ from typing import Any, NamedTuple
 
 from sceneprior.apps.config import load_any_run
 from sceneprior.apps.experiments.commands import read_journal, read_result
-from sceneprior.apps.experiments.comparison import Comparison, ViewComparison
-from sceneprior.apps.experiments.runs import LIFTED, PAPER, Run, Variant, variants_of
+from sceneprior.apps.experiments.comparison import (
+    LIFTED,
+    PAPER,
+    Comparison,
+    Run,
+    Variant,
+    ViewComparison,
+    variants_of,
+)
 from sceneprior.core.files import write_whole
 from sceneprior.evaluation.metric import ARROWS, TableColumn
 from sceneprior.evaluation.metrics import DECODED, METRICS
 from sceneprior.lifted.config import SAMPLER
 from sceneprior.paper.sampling import marked
 from sceneprior.training.checkpoints import read_checkpoint
+
+Scores = dict[str, Any]
+"""Values by key of a result, with its protocol, reference rows and the costs of training."""
 
 GAP = "–"
 DECODED_ROOMS = "of training rooms, decoded"
@@ -46,18 +56,17 @@ class Row(NamedTuple):
     """Result of one variant of a run."""
 
     rooms: str
-    rank: int
-    """Position of the row's group."""
-    group: str
-    title: str
-    variant: str
-    """Value of the second column, which distinguishes the row from other rows of its run."""
     seed: int
     """Seed of training."""
-    scores: dict[str, Any]
-    """Values by key of a result, with its protocol, reference rows and the costs of training."""
+    title: str
     made_by: str
     """Name of the method in captions (`Variant.made_by`)."""
+    variant: str
+    """Value of the second column, which distinguishes the row from other rows of its run."""
+    scores: Scores
+    group: str
+    rank: int
+    """Position of the row's group."""
 
 
 class Form(NamedTuple):
@@ -69,7 +78,7 @@ class Form(NamedTuple):
     """Key of the values in a result, by title, for each reference row, which needs no training."""
     variant: str
     """Heading of the second column."""
-    say: Callable[[dict[str, Any]], str]
+    say: Callable[[Scores], str]
     """Builds the caption's sentence on the evaluation from one of the results."""
 
 
@@ -88,35 +97,39 @@ def rows_of(comparison: Comparison, run: Run) -> list[Row]:
     """The rows of an evaluated run; the first row includes the costs of training."""
     found = {variant: read_result(variant.result) for variant in variants_of(comparison, run)}
     of_task = _rows_of_views if isinstance(comparison, ViewComparison) else _rows_of_rooms
-    rows = list(of_task(run, comparison.rooms[run.rooms].title, found))
+    rows = [
+        Row(comparison.rooms[run.rooms].title, run.seed, variant.title, variant.made_by, *rest)
+        for variant, *rest in of_task(found, run.run_config.learns_from)
+    ]
     rows[0].scores.update(costs_of(run))
     return rows
 
 
-def _rows_of_rooms(run: Run, rooms: str, found: dict[Variant, dict[str, Any]]) -> Iterator[Row]:
+def _rows_of_rooms(
+    found: dict[Variant, Scores], learns_from: str
+) -> Iterator[tuple[Variant, str, Scores, str, int]]:
     """A row for each distribution of latents, and one for decoded training rooms if there are
     any."""
-
-    def row(variant: Variant, origin: str, scores: dict[str, Any]) -> Row:
-        group = GROUPS[origin].format(run.run_config.learns_from)
-        rank = list(GROUPS).index(origin)
-        made = variant.title, marked(origin), run.seed, scores, variant.made_by
-        return Row(rooms, rank, group, *made)
-
-    for variant, scores in found.items():
-        # A result names the distribution of its rooms, with the mark of the version that wrote it.
-        yield row(variant, scores["protocol"]["latents"].split(",")[0], scores)
-    first, last = next(iter(found.values())), list(found)[-1]
+    # A result names the distribution of its rooms, with the mark of the version that wrote it.
+    rows = [
+        (variant, scores["protocol"]["latents"].split(",")[0], scores)
+        for variant, scores in found.items()
+    ]
+    first, last = rows[0][2], rows[-1][0]
     if decoded := first.get("decoded_rooms"):
         # The last variant decodes latents; a sampler, which decodes no room, would come first.
-        yield row(last, DECODED_ROOMS, {**decoded, "protocol": first["protocol"]})
+        rows.append((last, DECODED_ROOMS, {**decoded, "protocol": first["protocol"]}))
+    for variant, origin, scores in rows:
+        group = GROUPS[origin].format(learns_from)
+        yield variant, marked(origin), scores, group, list(GROUPS).index(origin)
 
 
-def _rows_of_views(run: Run, rooms: str, found: dict[Variant, dict[str, Any]]) -> Iterator[Row]:
+def _rows_of_views(
+    found: dict[Variant, Scores], learns_from: str
+) -> Iterator[tuple[Variant, str, Scores, str, int]]:
     """A row for each fit, and another one if its objects were also replaced by CAD models."""
-    group = f"trained on {run.run_config.learns_from}"
     for variant, result in found.items():
-        of: dict[str, dict[str, Any]] = {
+        of: dict[str, Scores] = {
             name: {**row["summary"], "intervals": row["intervals"]}
             for name, row in result["rows"].items()
         }
@@ -125,8 +138,7 @@ def _rows_of_views(run: Run, rooms: str, found: dict[Variant, dict[str, Any]]) -
         for name, shapes in SHAPES.items():
             if name in of:
                 scores = {**of[name], **references, "protocol": result["protocol"]}
-                made = variant.title, shapes, run.seed, scores, variant.made_by
-                yield Row(rooms, 0, group, *made)
+                yield variant, shapes, scores, f"trained on {learns_from}", 0
 
 
 def costs_of(run: Run) -> dict[str, int | float | None]:
@@ -152,21 +164,14 @@ def costs_of(run: Run) -> dict[str, int | float | None]:
 
 def markdown(rows: Sequence[Row], form: Form) -> str:
     """A Markdown table for each kind of rooms, with methods under the headings of their groups."""
-    parts = []
-    for rooms, own in _by(rows, lambda row: row.rooms).items():
-        columns = {
-            key: column
-            for key, column in (form.columns | COSTS).items()
-            if any(row.scores.get(key) is not None for row in own)
-        }
-        head = ["method", form.variant, *(column.title for column in columns.values())]
-        lines = [f"### {rooms}", "", _caption(own, form), "", _line(head)]
-        lines.append("| --- | --- |" + " ---: |" * len(columns))
-        lines += [_line(cells) for cells in _body(own, columns, form)]
-        parts.append("\n".join(lines))
-    notes = [column.note for column in form.columns.values() if column.note]
+    tables = [
+        f"### {own[0].rooms}\n\n{_caption(own, form)}\n\n"
+        + "\n".join(f"| {' | '.join(cells)} |" for cells in _lines(own, form))
+        for own in _by(rows, "rooms")
+    ]
+    notes = "; ".join(column.note for column in form.columns.values() if column.note)
     seeds = "A value of several seeds is their mean ± half their range."
-    return "\n\n".join([*parts, f"{'; '.join(notes)}. {seeds}"]) + "\n"
+    return "\n\n".join([*tables, f"{notes}. {seeds}"]) + "\n"
 
 
 def as_csv(rows: Sequence[Row], form: Form) -> str:
@@ -181,34 +186,33 @@ def as_csv(rows: Sequence[Row], form: Form) -> str:
     return text.getvalue()
 
 
-def _line(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"
+def _lines(rows: Sequence[Row], form: Form) -> Iterator[list[str]]:
+    """The cells of each line of a table, including its head and the headings of groups."""
+    columns = {
+        key: column
+        for key, column in (form.columns | COSTS).items()
+        if any(row.scores.get(key) is not None for row in rows)
+    }
 
-
-def _body(rows: Sequence[Row], columns: dict[str, TableColumn], form: Form) -> Iterator[list[str]]:
-    """The cells of each line, including the headings of groups."""
-
-    def line(title: str, second: str, found: Sequence[dict[str, Any]]) -> list[str]:
+    def line(title: str, second: str, found: Sequence[Scores]) -> list[str]:
         return [title, second, *(_cell(found, key, of) for key, of in columns.items())]
 
+    yield ["method", form.variant, *(column.title for column in columns.values())]
+    yield ["---", "---", *["---:"] * len(columns)]
     empty = [""] * (len(columns) + 1)
     yield ["*reference*", *empty]
     for title, name in form.references.items():
         yield line(title, GAP, [rows[0].scores.get(name, {})])
-    ranked = sorted(rows, key=lambda row: row.rank)
-    for group, members in _by(ranked, lambda row: row.group).items():
-        yield [f"*{group}*", *empty]
-        for runs in _by(members, lambda row: f"{row.title}: {row.variant}").values():
+    for members in _by(sorted(rows, key=lambda row: row.rank), "group"):
+        yield [f"*{members[0].group}*", *empty]
+        for runs in _by(members, "title", "variant"):
             yield line(runs[0].title, runs[0].variant, [row.scores for row in runs])
 
 
-def _cell(found: Sequence[dict[str, Any]], key: str, column: TableColumn) -> str:
+def _cell(found: Sequence[Scores], key: str, column: TableColumn) -> str:
     """The mean of a value over seeds, with half its range, or one value with its interval."""
-    values = [
-        float(scores[key]) * FACTORS.get(key, 1.0)
-        for scores in found
-        if scores.get(key) is not None
-    ]
+    known = [scores[key] for scores in found if scores.get(key) is not None]
+    values = [float(value) * FACTORS.get(key, 1.0) for value in known]
     if not values:
         return GAP
     middle = f"{mean(values):,.{column.digits}f}"
@@ -220,11 +224,12 @@ def _cell(found: Sequence[dict[str, Any]], key: str, column: TableColumn) -> str
     return f"{middle} ± {(max(values) - min(values)) / 2:.{column.digits}f}"
 
 
-def _by(rows: Sequence[Row], key: Callable[[Row], str]) -> dict[str, list[Row]]:
-    groups: dict[str, list[Row]] = {}
+def _by(rows: Sequence[Row], *names: str) -> list[list[Row]]:
+    """Rows with equal values of these fields, in the order of their first rows."""
+    groups: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
-        groups.setdefault(key(row), []).append(row)
-    return groups
+        groups.setdefault(tuple(getattr(row, name) for name in names), []).append(row)
+    return list(groups.values())
 
 
 def _caption(rows: Sequence[Row], form: Form) -> str:
@@ -237,7 +242,7 @@ def _caption(rows: Sequence[Row], form: Form) -> str:
     return f"Rows {'; '.join(parts)}. {form.say(rows[0].scores)}; seeds {told}."
 
 
-def _say_rooms(scores: dict[str, Any]) -> str:
+def _say_rooms(scores: Scores) -> str:
     protocol = scores["protocol"]
     return (
         f"{protocol['n_generated']} generated rooms per run against {protocol['n_test']} test "
@@ -245,7 +250,7 @@ def _say_rooms(scores: dict[str, Any]) -> str:
     )
 
 
-def _say_views(scores: dict[str, Any]) -> str:
+def _say_views(scores: Scores) -> str:
     protocol = scores["protocol"]
     surfaces, known = scores["with_surface"], protocol["known_model_share"]
     objects = f"{scores['objects']} objects"

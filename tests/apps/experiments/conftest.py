@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from toy_metrics import without_classifiers
 
-from sceneprior.apps.experiments import evaluate
+from sceneprior.apps.experiments import report as pages
 from sceneprior.apps.rooms import write_scenes
 from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.evaluation import report
@@ -31,8 +31,8 @@ def no_classifier(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(autouse=True)
 def few_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Report pages show two rooms of each kind and one curve: pictures take most of their time."""
-    for module in (report, evaluate):
+    for module in (report, pages):
         monkeypatch.setattr(module, "ROOMS_SHOWN", 2)
     monkeypatch.setattr(report, "DECODED_SHOWN", 2)
-    monkeypatch.setattr(evaluate, "UNFOLDING_STEPS", 2)
-    monkeypatch.setattr(evaluate, "CURVES", ("loss",))
+    monkeypatch.setattr(pages, "UNFOLDING_STEPS", 2)
+    monkeypatch.setattr(pages, "CURVES", ("loss",))

@@ -17,14 +17,16 @@ from tiny_runs import tiny_baseline_settings
 from sceneprior.apps.cli.commands import app
 from sceneprior.apps.config import load_any_run
 from sceneprior.apps.experiments import commands, table
-from sceneprior.apps.experiments.compare import Compared, commands_of, compare
-from sceneprior.apps.experiments.runs import load_comparison, part_of, runs_of, shards_of
+from sceneprior.apps.experiments.compare import Compared, commands_of, compare, part_of
+from sceneprior.apps.experiments.comparison import load_comparison, runs_of, shards_of
 from sceneprior.apps.experiments.table import costs_of, rows_of
 from sceneprior.core.errors import ConfigError, InputError
 from sceneprior.core.files import write_json
 from sceneprior.paper.fit_image import SCHEDULES, FitSchedule
 
 MAIN = partial(app, standalone_mode=False)
+SHARED = ["-n", "4", "--seed", "0", "--boxes"]
+"""Options of `eval-fid` that the rows of `write_comparison` share."""
 
 
 @pytest.fixture
@@ -137,7 +139,7 @@ def begun(toy_run, toy_shards, tmp_path):
     for path in run.folder.rglob("final.ckpt"):  # kept runs are without optimizers
         torch.save(torch.load(path, weights_only=True) | {"optimizer_states": [{}]}, path)
     journal = {}
-    for number, each in enumerate(commands_of(comparison, run, 4)):
+    for number, each in enumerate(commands_of(comparison, run, SHARED)):
         journal[each.name] = {
             "arguments": each.arguments, "depends_on": each.depends_on, "finished": True,
             "cpu_s": 2.5, "wall_s": 3.0, "peak_memory_gib": 0.5,
@@ -257,7 +259,9 @@ def test_a_fit_of_single_views_is_scored_and_tabulated(toy_run, toy_shards, tmp_
     run = runs_of(comparison, tmp_path / "out")[0]
     shutil.copytree(toy_run, run.folder / "run")
     monkeypatch.setattr(table, "costs_of", lambda run: {"parameters": 7})
-    commands.call(MAIN, commands_of(comparison, run, 1)[-1].arguments, tmp_path / "log")
+    shared = comparison.shared_options(toy_shards, None)
+    scoring = commands_of(comparison, run, shared)[-1]
+    commands.call(MAIN, scoring.arguments, tmp_path / "log")
     (row,) = rows_of(comparison, run)
     assert row.title == "Paper: fit of a latent" and row.scores["parameters"]
     assert row.scores["images"] == 2 and row.scores["seconds"] > 0

@@ -11,7 +11,7 @@ import pytest
 from refusals import refused
 
 from sceneprior.apps.config import load_run
-from sceneprior.apps.experiments.evaluate_views import mask_scores
+from sceneprior.apps.experiments.evaluate import mask_scores
 from sceneprior.apps.rooms import write_scenes
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.dataset import allowed_views
