@@ -1,7 +1,7 @@
 """Builds a folder of shards from a source, in parallel and resumable.
 
 Every `prep-*` command runs this engine. It prepares the source's rooms shard by shard in worker
-processes (workers.py), and writes a report at the end. `plan.json` is written first, and of each
+processes (source.py), and writes a report at the end. `plan.json` is written first, and of each
 shard its models, its report and, last, the shard itself; files are whole or absent, so that a run
 may be killed anywhere and resumed by the same command.
 """
@@ -33,8 +33,7 @@ from data_prep.engine.report import (
     line_of,
     report_csv,
 )
-from data_prep.engine.source import Line, PreparedRoom, RoomTask, Source, sentence_of
-from data_prep.engine.workers import Run, pool
+from data_prep.engine.source import Line, PreparedRoom, Run, Source, pool, sentence_of
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import (
     json_text,
@@ -195,35 +194,33 @@ def _report_path(shard: Path) -> Path:
 def _prepared(
     source: Source, out: Path, renderer: Renderer | None, shard: ShardTask, lines: list[Line]
 ) -> Iterator[tuple[RoomViews, RoomGroundTruth | None]]:
-    """Prepare the shard's rooms one by one, write their models, append outcomes to `lines`."""
+    """Prepare the shard's rooms one by one, write their models, append outcomes to `lines`.
+
+    Any exception becomes the failure of one room alone.
+    """
     for task in shard.rooms:
-        result = _prepare(source, task, renderer)
+        result: PreparedRoom | Line
+        try:
+            result = source.prepare(task, renderer)
+            if isinstance(result, PreparedRoom):
+                check_views(task.house, result.views)
+        except Exception as error:
+            result = Line(task.room_id, task.house, "failed", reason=sentence_of(error))
         lines.append(line_of(result, task, source.label_set))
         if isinstance(result, Line):
             continue
         for model_id, mesh in result.models.items():
-            _write_model(out / MODELS_FOLDER / f"{model_id}.ply", mesh)
+            path = out / MODELS_FOLDER / f"{model_id}.ply"
+            if not path.is_file():
+                write_whole(path, _ply_bytes(mesh))
         yield result.views, result.truth
 
 
-def _prepare(source: Source, task: RoomTask, renderer: Renderer | None) -> PreparedRoom | Line:
-    """Prepare one room; any exception becomes the failure of this room alone."""
-    try:
-        result = source.prepare(task, renderer)
-        if isinstance(result, PreparedRoom):
-            check_views(task.house, result.views)
-        return result
-    except Exception as error:
-        return Line(task.room_id, task.house, "failed", reason=sentence_of(error))
-
-
-def _write_model(path: Path, mesh: Mesh) -> None:
-    if path.is_file():
-        return
+def _ply_bytes(mesh: Mesh) -> bytes:
     import trimesh
 
     bare = trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False)
-    write_whole(path, trimesh.exchange.ply.export_ply(bare, encoding="binary", vertex_normal=False))
+    return trimesh.exchange.ply.export_ply(bare, encoding="binary", vertex_normal=False)
 
 
 def _finish(out: Path, plan: JobPlan, totals: Summary) -> None:

@@ -152,14 +152,11 @@ def seeded_split(
     at least one room, `test` before `val`, as long as one is left for `train`.
     """
     order = sorted(room_ids, key=lambda item: hashlib.sha256(f"{seed}:{item}".encode()).digest())
-    tests = _size(test_share, len(order), len(order))
-    vals = _size(val_share, len(order), len(order) - tests)
-    names = ["test"] * tests + ["val"] * vals
+    names: list[str] = []
+    for split, share in (("test", test_share), ("val", val_share)):
+        if share > 0:
+            names += [split] * min(round(share * len(order)) or 1, len(order) - len(names) - 1)
     return dict(zip(order, names + ["train"] * (len(order) - len(names)), strict=True))
-
-
-def _size(share: float, rooms: int, left: int) -> int:
-    return min(round(share * rooms) or 1, left - 1) if share > 0 else 0
 
 
 def of_one_size(

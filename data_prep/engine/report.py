@@ -19,8 +19,8 @@ REPORT_NAME = "report.json"
 TABLE_NAME = "report.csv"
 REPORT_FILES = (INDEX_NAME, REPORT_NAME, TABLE_NAME)
 """Files of a finished folder, in the order of their deletion when work begins again."""
-_FAILURES_SHOWN = 10
-_NOTES_SHOWN = 10
+_SHOWN = 10
+"""Number of notes, and of failures, that the terminal shows."""
 _COUNTS = ("rooms", "views", "objects")
 _MEANS = ("views_per_room", "objects_per_room", "objects_per_view")
 _COLUMNS = ("room_id", "house", "split", "status", "rule", "reason", "views", "objects", "notes")
@@ -30,8 +30,7 @@ def line_of(result: PreparedRoom | Line, task: RoomTask, label_set_name: str) ->
     """Report line of a room that was prepared or left out, with the room's split."""
     if isinstance(result, Line):
         return replace(result, split=task.split)
-    names = label_set(label_set_name)
-    views = result.views
+    names, views = label_set(label_set_name), result.views
     return Line(
         task.room_id,
         task.house,
@@ -49,15 +48,12 @@ def line_of(result: PreparedRoom | Line, task: RoomTask, label_set_name: str) ->
 
 def count_splits(lines: Iterable[Line]) -> dict[str, dict[str, int]]:
     """Numbers of rooms, views and objects per split."""
-    prepared = [line for line in lines if line.status == "prepared"]
-    return {
-        split: {
-            "rooms": sum(line.split == split for line in prepared),
-            "views": sum(line.views for line in prepared if line.split == split),
-            "objects": sum(line.objects for line in prepared if line.split == split),
-        }
-        for split in SPLITS
-    }
+    counts = {split: dict.fromkeys(_COUNTS, 0) for split in SPLITS}
+    for line in lines:
+        if line.status == "prepared":
+            for name, count in zip(_COUNTS, (1, line.views, line.objects), strict=True):
+                counts[line.split][name] += count
+    return counts
 
 
 def make_report(lines: Sequence[Line], about: dict[str, Any]) -> dict[str, Any]:
@@ -70,12 +66,15 @@ def make_report(lines: Sequence[Line], about: dict[str, Any]) -> dict[str, Any]:
     for line in lines:
         if line.status == "filtered":
             filtered.setdefault(line.rule, []).append(line.room_id)
+    kinds_of_notes: Counter[str] = Counter()  # names and numbers are masked
+    for line in prepared:
+        kinds_of_notes.update({re.sub(r"'[^']*'|\S*\d\S*", "...", note) for note in line.notes})
     return {
         "format": "sceneprior-report",
         "version": 1,
         **about,
         "found": len(lines),
-        "statuses": dict(sorted(Counter(line.status for line in lines).items())),
+        "statuses": _sums({line.status: 1} for line in lines),
         "filtered": {
             rule: {"rooms": len(ids), "room_ids": ids} for rule, ids in sorted(filtered.items())
         },
@@ -85,10 +84,11 @@ def make_report(lines: Sequence[Line], about: dict[str, Any]) -> dict[str, Any]:
             if line.status == "failed"
         ],
         "with_notes": sum(bool(line.notes) for line in prepared),
-        "notes": _kinds_of_notes(prepared),
-        "counts": count_splits(lines),
+        "notes": dict(_most_first(kinds_of_notes)),
+        "counts": (counts := count_splits(lines)),
         "per_split": {
-            split: _means([line for line in prepared if line.split == split]) for split in SPLITS
+            split: _means(counts[split], [line for line in prepared if line.split == split])
+            for split in SPLITS
         },
         "classes": _sums(line.classes for line in prepared),
         "unknown_categories": _sums(line.unknown_categories for line in lines),
@@ -96,25 +96,14 @@ def make_report(lines: Sequence[Line], about: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _kinds_of_notes(lines: Sequence[Line]) -> dict[str, int]:
-    """Number of rooms per type of note (names and numbers masked), most frequent first."""
-    kinds: Counter[str] = Counter()
-    for line in lines:
-        kinds.update({re.sub(r"'[^']*'|\S*\d\S*", "...", note) for note in line.notes})
-    return dict(sorted(kinds.items(), key=lambda item: (-item[1], item[0])))
-
-
-def _means(lines: Sequence[Line]) -> dict[str, Any]:
-    rooms = max(len(lines), 1)
-    views = sum(line.views for line in lines)
+def _means(counts: dict[str, int], lines: Sequence[Line]) -> dict[str, Any]:
+    rooms, views = max(counts["rooms"], 1), max(counts["views"], 1)
+    of_sizes = sorted(Counter(line.objects for line in lines).items())
     return {
-        "views_per_room": round(views / rooms, 3),
-        "objects_per_room": round(sum(line.objects for line in lines) / rooms, 3),
-        "objects_per_view": round(sum(line.visible for line in lines) / max(views, 1), 3),
-        "rooms_of_so_many_objects": {
-            str(count): rooms
-            for count, rooms in sorted(Counter(line.objects for line in lines).items())
-        },
+        "views_per_room": round(counts["views"] / rooms, 3),
+        "objects_per_room": round(counts["objects"] / rooms, 3),
+        "objects_per_view": round(sum(line.visible for line in lines) / views, 3),
+        "rooms_of_so_many_objects": {str(objects): count for objects, count in of_sizes},
         "classes": _sums(line.classes for line in lines),
     }
 
@@ -126,6 +115,10 @@ def _sums(counts: Iterable[dict[str, int]]) -> dict[str, int]:
     return dict(sorted(total.items()))
 
 
+def _most_first(counts: dict[str, int]) -> list[tuple[str, int]]:
+    return sorted(counts.items(), key=lambda item: (-item[1], item[0]))
+
+
 def report_csv(lines: Iterable[Line]) -> str:
     """CSV table with one row per room, for spreadsheets and grep."""
     table = io.StringIO()
@@ -135,16 +128,6 @@ def report_csv(lines: Iterable[Line]) -> str:
         row = asdict(line) | {"notes": " | ".join(line.notes)}
         writer.writerow([row[column] for column in _COLUMNS])
     return table.getvalue()
-
-
-def _compared(of: str, official: dict[str, int], counts: dict[str, Any]) -> dict[str, Any]:
-    found = {split: count["rooms"] for split, count in counts.items()}
-    found |= {what: sum(count[what] for count in counts.values()) for what in _COUNTS}
-    rows = [
-        {"what": what, "expected": count, "found": found[what], "difference": found[what] - count}
-        for what, count in official.items()
-    ]
-    return {"of": of, "rows": rows}
 
 
 @dataclass(frozen=True)
@@ -174,15 +157,13 @@ class Summary:
     @property
     def report(self) -> dict[str, Any]:
         """Contents of `report.json`."""
-        about: dict[str, Any] = {
+        about = {
             "source": self.source.name,
             "room_type": self.source.room_type,
             "label_set": self.source.label_set,
             "renderer": self.renderer,
             "summary": str(self),
         }
-        if self.source.official is not None:
-            about["expected"] = _compared(*self.source.official, self.counts)
         return make_report(self.lines, about)
 
     def __str__(self) -> str:
@@ -218,9 +199,8 @@ def report_tables(report: dict[str, Any]) -> list[Table]:
         ("prepared", statuses.get("prepared", 0)),
         *((f"filtered by {rule}", group["rooms"]) for rule, group in report["filtered"].items()),
         ("failed", statuses.get("failed", 0)),
+        *[("prepared with notes", report["with_notes"])] * bool(report["with_notes"]),
     ]
-    if report["with_notes"]:
-        outcomes.append(("prepared with notes", report["with_notes"]))
     splits = [
         (split, *(counts[key] for key in _COUNTS), *(f"{means[split][key]:.2f}" for key in _MEANS))
         for split, counts in report["counts"].items()
@@ -229,32 +209,25 @@ def report_tables(report: dict[str, Any]) -> list[Table]:
         (name, *(means[split]["classes"].get(name, 0) for split in report["counts"]))
         for name, _ in _most_first(report["classes"])
     ]
+    columns = ("split", *_COUNTS, *(name.replace("_", " ") for name in _MEANS))
     tables = [
         make_table(("rooms", ""), outcomes),
-        make_table(
-            ("split", *_COUNTS, "views per room", "objects per room", "objects per view"), splits
-        ),
+        make_table(columns, splits),
         make_table(("class", *report["counts"]), classes),
     ]
-    if notes := [*report["notes"].items()]:
-        more = [(f"and {len(notes) - _NOTES_SHOWN} more: report.csv", "")]
-        rows = notes[:_NOTES_SHOWN] + more * (len(notes) > _NOTES_SHOWN)
-        about = Column("note of prepared rooms", overflow="fold")
-        tables.append(make_table((about, "rooms"), rows))
+
+    def add_some(name: str, other: str, rows: list[tuple[str, Any]], more: tuple[str, str]) -> None:
+        if rows:
+            cells = rows[:_SHOWN] + [more] * (len(rows) > _SHOWN)
+            tables.append(make_table((Column(name, overflow="fold"), other), cells))
+
+    notes = [*report["notes"].items()]
+    more = f"and {len(notes) - _SHOWN} more: report.csv", ""
+    add_some("note of prepared rooms", "rooms", notes, more)
     if unknown := _most_first(report["unknown_categories"]):
         why = "counted as void: the recipe does not list them"
         tables.append(make_table(("category without a class", "pieces"), unknown, why))
-    if failed := [(item["room_id"], item["reason"]) for item in report["failed"]]:
-        more = [(f"and {len(failed) - _FAILURES_SHOWN} more", "report.csv lists all of them")]
-        rows = failed[:_FAILURES_SHOWN] + more * (len(failed) > _FAILURES_SHOWN)
-        tables.append(make_table((Column("failed", overflow="fold"), "why"), rows))
-    if expected := report.get("expected"):
-        columns = ("what", "expected", "found", "difference")
-        cells = [[row[name] for name in columns] for row in expected["rows"]]
-        rows = [(*others, f"{more:+d}" if more else "as expected") for *others, more in cells]
-        tables.append(make_table(columns, rows, expected["of"]))
+    failed = [(item["room_id"], item["reason"]) for item in report["failed"]]
+    more = f"and {len(failed) - _SHOWN} more", "report.csv lists all of them"
+    add_some("failed", "why", failed, more)
     return tables
-
-
-def _most_first(counts: dict[str, int]) -> list[tuple[str, int]]:
-    return sorted(counts.items(), key=lambda item: (-item[1], item[0]))

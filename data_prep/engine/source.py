@@ -1,15 +1,21 @@
-"""The interface between a data set (`Source`) and the engine.
+"""The interface between a data set (`Source`) and the engine, and the processes it works in.
 
-A source reads the files of a data set and knows no processes, shards or reports; the engine
-(build.py) handles those and knows no data set. `front/source.py` is the source for 3D-FRONT.
+A source reads the files of a data set and knows no shards or reports; the engine (build.py) handles
+those and knows no data set. `front/source.py` is the source for 3D-FRONT.
 """
 
+import contextlib
+import multiprocessing
 import os
-from collections.abc import Mapping
+import signal
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
+from multiprocessing.connection import wait
 from typing import Any, Protocol
 
-from data_prep.engine.workers import Run
 from sceneprior.core.errors import InputError
 from sceneprior.core.observations import RoomGroundTruth, RoomViews
 from sceneprior.core.scene import Mesh
@@ -17,7 +23,9 @@ from sceneprior.render.offscreen import Renderer
 
 SPLITS = ("train", "val", "test")
 """Rooms for training, for choosing settings and checkpoints, and for reporting results."""
-_DEBUG_VARIABLE = "SCENEPRIOR_DEBUG"
+
+Run = Callable[..., Iterator[Any]]
+"""`run(function, argument_lists, title)` yields results in order (`pool`)."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +112,6 @@ class Source(Protocol):
         room_type: Type of the rooms; also in the shards' names: `train/<room_type>_0000.h5`.
         draws: True if `prepare` needs a renderer; otherwise it gets None.
         only: Requested part: HOUSE, HOUSE/ROOM or a room id (plan.py); None for everything.
-        official: Origin of official counts and the counts, which the report compares with; or None.
     """
 
     @property
@@ -117,8 +124,6 @@ class Source(Protocol):
     def draws(self) -> bool: ...
     @property
     def only(self) -> str | None: ...
-    @property
-    def official(self) -> tuple[str, dict[str, int]] | None: ...
 
     def settings(self, only: str | None) -> dict[str, Any]:
         """Settings that the shards' bytes depend on, as JSON, without paths.
@@ -149,6 +154,78 @@ def sentence_of(error: Exception) -> str:
         return str(error)
     if isinstance(error, OSError) and error.filename:
         return f"{error.filename} cannot be read ({error.strerror})"
-    if os.environ.get(_DEBUG_VARIABLE):
+    if os.environ.get("SCENEPRIOR_DEBUG"):
         raise error
     return " ".join(f"unforeseen {type(error).__name__}: {error}".split())[:300]
+
+
+@contextlib.contextmanager
+def pool(workers: int) -> Iterator[Run]:
+    """Open a process pool as `run(function, argument_lists, title)`, which yields results in order.
+
+    A single worker is this process itself. A progress bar goes to stderr if there is a title.
+    """
+    if workers <= 1:
+        yield _in_process
+        return
+    # Processes are spawned, never forked, because a GL context does not survive a fork.
+    context = multiprocessing.get_context("spawn")
+    executor = ProcessPoolExecutor(workers, context, initializer=_start_worker)
+
+    def submit(function: Callable[..., Any], *item: Any) -> Any:
+        # Only this process handles Ctrl-C; workers inherit the blocked signal.
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            return executor.submit(function, *item)
+        finally:
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+
+    def in_order(
+        function: Callable[..., Any], arguments: list[Any], title: str | None
+    ) -> Iterator[Any]:
+        for future in _tracked([submit(function, *item) for item in arguments], title):
+            yield future.result()
+
+    try:
+        yield in_order
+    except BrokenProcessPool:
+        raise InputError(
+            "A worker process died (was it killed for lack of memory?). Finished shards are kept: "
+            "run the same command again, perhaps with fewer --workers."
+        ) from None
+    except BaseException:
+        # Killing them leaves no partial files: files are written whole or not at all.
+        for worker in multiprocessing.active_children():
+            worker.kill()
+        raise
+    finally:
+        executor.shutdown(wait=True, cancel_futures=True)
+
+
+def _in_process(
+    function: Callable[..., Any], arguments: list[Any], title: str | None
+) -> Iterator[Any]:
+    for item in _tracked(arguments, title):
+        yield function(*item)
+
+
+def _tracked(items: list[Any], title: str | None) -> Iterable[Any]:
+    """The items, with a progress bar on stderr if there is a title."""
+    if title is None or not items:
+        return items
+    from rich.console import Console
+    from rich.progress import track
+
+    return track(items, title, console=Console(stderr=True))
+
+
+def _start_worker() -> None:
+    # llvmpipe's own threads would compete with the other workers for the same cores.
+    os.environ.setdefault("LP_NUM_THREADS", "1")
+    parent = multiprocessing.parent_process()
+
+    def end_with_parent() -> None:
+        wait([parent.sentinel])  # type: ignore[union-attr]
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()

@@ -20,10 +20,10 @@ from data_prep.engine.source import (
     Line,
     PreparedRoom,
     RoomTask,
+    Run,
     Survey,
     sentence_of,
 )
-from data_prep.engine.workers import Run
 from data_prep.front.drawing import prepare_room
 from data_prep.front.furnished import Room, broken_rule, outside_floor, unknown_categories
 from data_prep.front.houses import House, house_files, parse_house, read_house
@@ -44,7 +44,6 @@ class FrontSource:
 
     name: ClassVar = "3d-front"
     draws: ClassVar = True
-    official: ClassVar = None
     front: Path
     future: Path
     recipe: Recipe

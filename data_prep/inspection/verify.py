@@ -9,8 +9,7 @@ import numpy as np
 
 from data_prep.engine.plan import in_words
 from data_prep.engine.report import REPORT_NAME
-from data_prep.engine.source import SPLITS, Line
-from data_prep.engine.workers import pool
+from data_prep.engine.source import SPLITS, Line, pool
 from data_prep.inspection.agreement import (
     Agreement,
     Limits,

@@ -19,10 +19,10 @@ from data_prep.engine.source import (
     Line,
     PreparedRoom,
     RoomTask,
+    Run,
     Survey,
     sentence_of,
 )
-from data_prep.engine.workers import Run
 from data_prep.readers.annotations import LABEL_SET
 from data_prep.readers.rooms import FramedRoom, prepare_room
 from sceneprior.core.errors import InputError
@@ -83,11 +83,6 @@ class Reader(ABC):
     def room_type(self) -> str:
         """Type of the rooms; also in the shards' names."""
         return self.name
-
-    @property
-    def official(self) -> tuple[str, dict[str, int]] | None:
-        """See `Source.official`."""
-        return None
 
     @abstractmethod
     def scenes(self) -> list[str]:

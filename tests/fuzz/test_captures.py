@@ -21,7 +21,7 @@ from mutating import MUTATIONS, damaged_json
 from pycocotools.mask import encode
 from toy_formats import FORMATS
 
-from data_prep.engine.workers import pool
+from data_prep.engine.source import pool
 from data_prep.front.furnished import broken_rule
 from data_prep.front.houses import read_house
 from data_prep.front.models import ModelBank

@@ -10,8 +10,7 @@ from front_files import FrontFolder, bedroom, room
 from front_reading import shared_front
 from refusals import refused
 
-from data_prep.engine.source import Survey
-from data_prep.engine.workers import pool
+from data_prep.engine.source import Survey, pool
 from data_prep.front.houses import read_house
 from data_prep.front.models import ModelBank
 from data_prep.front.recipe import load_recipe

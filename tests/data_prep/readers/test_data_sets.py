@@ -20,8 +20,7 @@ from public_files import (
 from refusals import refused
 from scan_files import write_table
 
-from data_prep.engine.source import RoomTask
-from data_prep.engine.workers import pool
+from data_prep.engine.source import RoomTask, pool
 from data_prep.readers import open_reader
 from data_prep.readers.annotations import NYU40, SHELL, ids_and_classes
 from data_prep.readers.frames import GL_TO_CV, Y_UP

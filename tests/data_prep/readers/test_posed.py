@@ -11,8 +11,7 @@ from posed_files import SET, PosedRoom, Thing, furniture, prepared
 from tiny_runs import tiny_config
 
 from data_prep.engine.build import Job, build_shards
-from data_prep.engine.source import RoomTask
-from data_prep.engine.workers import pool
+from data_prep.engine.source import RoomTask, pool
 from data_prep.inspection.verify import array_problems, mask_problems
 from data_prep.readers.posed.reader import Posed, find_rooms
 from data_prep.readers.posed.recording import frame_intrinsics, room_name, seems_up

@@ -20,8 +20,7 @@ from scan_files import frame_header, png, sens_bytes, sens_header, write_ply, wr
 from toy_formats import FORMATS
 
 from data_prep.engine.plan import read_splits
-from data_prep.engine.source import Line, RoomTask
-from data_prep.engine.workers import pool
+from data_prep.engine.source import Line, RoomTask, pool
 from data_prep.readers import DATA_SETS, open_reader
 from data_prep.readers.posed.formats import read_formats, read_label_set
 from data_prep.readers.posed.reader import Posed, find_rooms

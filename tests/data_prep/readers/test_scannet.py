@@ -28,8 +28,7 @@ from scan_files import (
 )
 
 from data_prep.engine.build import Job, build_shards
-from data_prep.engine.source import Line, RoomTask
-from data_prep.engine.workers import pool
+from data_prep.engine.source import Line, RoomTask, pool
 from data_prep.inspection.agreement import true_bodies
 from data_prep.inspection.verify import agreement_of, verify
 from data_prep.readers.annotations import read_labels
@@ -567,11 +566,6 @@ def test_the_command_writes_shards_whose_boxes_project_onto_their_masks(source, 
     made = cli(*words, *lists, "--out", tmp_path / "a")
     assert made.exit_code == 0, made.output
     assert "train 3 rooms, 15 views, 6 objects; test 1 rooms, 5 views, 2 objects" in made.stdout
-    report = json.loads((tmp_path / "a" / "report.json").read_text())
-    assert [(row["what"], row["difference"]) for row in report["expected"]["rows"]] == [
-        ("rooms", 4 - 1513), ("train", 3 - 1201), ("test", 1 - 312), ("views", 20 - 108_059),
-    ]  # fmt: skip
-    assert "-1509" in made.stdout and "ScanNet v2 by its lists" in made.stdout
     checked = cli("inspect", tmp_path / "a", "--verify")
     said = " ".join(checked.stdout.split())
     assert checked.exit_code == 0 and "projected meshes" in said

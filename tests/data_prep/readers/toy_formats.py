@@ -24,8 +24,7 @@ from room_scans import ROOM_TABLE, make_room_scan
 from scan_files import ScanFolder, make_scan, write_table
 from scipy.spatial.transform import Rotation
 
-from data_prep.engine.source import PreparedRoom, Source
-from data_prep.engine.workers import pool
+from data_prep.engine.source import PreparedRoom, Source, pool
 from data_prep.readers import open_reader
 from data_prep.readers.posed.reader import Posed
 from data_prep.readers.scannet import ScanNet
