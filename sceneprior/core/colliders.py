@@ -66,7 +66,18 @@ def convex_parts(mesh: Mesh) -> tuple[Mesh, ...]:
     parts, is first divided into these. Nearly convex components are replaced by their convex hulls.
     CoACD decomposes the others; if it is not installed, they are replaced by their hulls, too.
     """
-    return tuple(part for piece in closed_components(mesh) for part in _divided(piece))
+    coacd, parts = _coacd(), []
+    for piece in closed_components(mesh):
+        vertices = np.asarray(piece.vertices_m, dtype=np.float64)
+        found = [Mesh(*convex_surface(vertices))]
+        enough = (1 - CONCAVITY) * volume_and_centroid(found[0])[0]
+        if coacd and len(found[0].faces) and volume_and_centroid(piece)[0] < enough:
+            pieces = coacd.run_coacd(
+                coacd.Mesh(vertices, np.asarray(piece.faces)), threshold=CONCAVITY, **SEARCH
+            )
+            found = [Mesh(*convex_surface(np.asarray(each))) for each, _ in pieces] or found
+        parts += found
+    return tuple(parts)
 
 
 def closed_components(mesh: Mesh) -> list[Mesh]:
@@ -90,22 +101,6 @@ def closed_components(mesh: Mesh) -> list[Mesh]:
     # A component with inward faces is a cavity of another component.
     outward = all(volume_and_centroid(piece)[0] > LEAST_M3 for piece in pieces)
     return pieces if pieces and outward else [mesh]
-
-
-def _divided(mesh: Mesh) -> tuple[Mesh, ...]:
-    """The convex hull of a nearly convex mesh; otherwise its decomposition by CoACD."""
-    coacd = _coacd()
-    hull = Mesh(*convex_surface(np.asarray(mesh.vertices_m, dtype=np.float64)))
-    if coacd is None or not len(hull.faces):
-        return (hull,)
-    if volume_and_centroid(mesh)[0] >= (1 - CONCAVITY) * volume_and_centroid(hull)[0]:
-        return (hull,)
-    found = coacd.run_coacd(
-        coacd.Mesh(np.asarray(mesh.vertices_m, dtype=np.float64), np.asarray(mesh.faces)),
-        threshold=CONCAVITY,
-        **SEARCH,
-    )
-    return tuple(Mesh(*convex_surface(np.asarray(vertices))) for vertices, _ in found) or (hull,)
 
 
 @cache

@@ -8,13 +8,14 @@ lies outside its support polygon would fall over, and gets supports.
 import itertools
 from collections import Counter
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import shapely
 from jaxtyping import Bool, Float
 
 from sceneprior.core.colliders import colliders, is_fixed, mesh_of, points_of, volume_and_centroid
-from sceneprior.core.scene import Mesh, Scene, SceneObject, Solid, Textured
+from sceneprior.core.scene import Mesh, Scene, SceneObject, Solid, Textured, join_meshes
 from sceneprior.core.shell import floor_polygon
 
 GAP_M = 2e-3
@@ -50,72 +51,54 @@ def make_stable(scene: Scene) -> tuple[Scene, Counter[str]]:
     # Convex parts of meshes take seconds, so they are computed once and kept as solids.
     with_bodies = tuple(replace(item, solids=colliders(item)) for item in scene.objects)
     objects = _set_down(with_bodies, changes)
-    objects = [item if is_fixed(item) else _on_feet(item, changes) for item in objects]
-    kept = _apart(scene, objects, changes)
+    on_feet = [item if is_fixed(item) else add_supports(item) for item in objects]
+    changes["given feet"] += sum(a is not b for a, b in zip(on_feet, objects, strict=True))
+    kept = _apart(scene, on_feet, changes)
     return replace(scene, objects=tuple(kept)), changes
 
 
 def body_boxes(item: SceneObject) -> Boxes:
-    """Boxes around the bodies of an object; bodies that are meshes are cut into slabs along x."""
-    boxes = []
+    """Boxes around the bodies of an object; meshes are cut into slabs along x, which follow a
+    rotated body better than one box."""
+    boxes: list[Any] = []
     for body in colliders(item):
-        if isinstance(body, Mesh):
-            boxes += _slabs(points_of(body))
-        else:
-            boxes.append(np.array([body.low_m, body.high_m]))
-    return np.array(boxes)
-
-
-def _slabs(points: Float[np.ndarray, "points 3"]) -> list[Float[np.ndarray, "2 3"]]:
-    """Boxes around slabs of a convex body, which follow a rotated body better than one box."""
-    low, high = points.min(axis=0), points.max(axis=0)
-    plan = shapely.convex_hull(shapely.MultiPoint(points[:, ::2]))
-    ends = np.linspace(low[0], high[0], SLABS + 1)
-    boxes = []
-    for start, end in itertools.pairwise(ends):
-        slice_ = shapely.clip_by_rect(plan, start, low[2], end, high[2])
-        if not slice_.is_empty:
-            _, near, _, far = slice_.bounds
-            boxes.append(np.array([[start, low[1], near], [end, high[1], far]]))
-    return boxes or [np.array([low, high])]
+        if not isinstance(body, Mesh):
+            boxes.append([body.low_m, body.high_m])
+            continue
+        points = points_of(body)
+        low, high = points.min(axis=0), points.max(axis=0)
+        plan = shapely.convex_hull(shapely.MultiPoint(points[:, ::2]))
+        slabs = []
+        for start, end in itertools.pairwise(np.linspace(low[0], high[0], SLABS + 1)):
+            part = shapely.clip_by_rect(plan, start, low[2], end, high[2])
+            if not part.is_empty:
+                _, near, _, far = part.bounds
+                slabs.append([[start, low[1], near], [end, high[1], far]])
+        boxes += slabs or [[low, high]]
+    return np.array(boxes, dtype=np.float64)
 
 
 def _set_down(objects: tuple[SceneObject, ...], changes: Counter[str]) -> list[SceneObject]:
     """Set each object on the floor or on the object below it, the lowest first."""
     placed = list(objects)
-    bounds = [body_boxes(item) for item in objects]
-    bottoms = np.array([each[:, 0, 1].min() for each in bounds])
+    boxes = [body_boxes(item) for item in objects]
+    low = np.array([each[:, 0].min(axis=0) for each in boxes]).reshape(-1, 3)
+    high = np.array([each[:, 1].max(axis=0) for each in boxes]).reshape(-1, 3)
+    bottoms = low[:, 1].copy()
     for row in np.argsort(bottoms, kind="stable"):
-        item, bottom = objects[row], bottoms[row]
+        item, bottom, height = objects[row], bottoms[row], 0.0
         if is_fixed(item):
             continue
-        height = 0.0
         if bottom > FLOOR_M:
-            tops = [
-                boxes[:, 1, 1].max()
-                for other, boxes in enumerate(bounds)
-                if other != row and _meets_in_plan(boxes, bounds[row])
-            ]
-            height = max((top for top in tops if abs(top - bottom) <= RESTS_M), default=0.0)
+            overlaps = np.minimum(high[row], high) - np.maximum(low[row], low) > 0
+            below = overlaps[:, [0, 2]].all(axis=1) & (np.abs(high[:, 1] - bottom) <= RESTS_M)
+            below[row] = False
+            height = float(high[below, 1].max(initial=0.0))
         if abs(bottom - height) > 1e-6:
             placed[row] = item.moved((0.0, float(height - bottom), 0.0))
-            bounds[row] = bounds[row] + np.array([0.0, height - bottom, 0.0])
+            high[row, 1] += height - bottom
             changes["set down"] += bool(abs(bottom - height) > 1e-3)
     return placed
-
-
-def _meets_in_plan(boxes: Boxes, others: Boxes) -> bool:
-    """True if the bounding rectangles of two objects overlap, seen from above."""
-    (low, high), (other_low, other_high) = (
-        (each[:, 0, ::2].min(axis=0), each[:, 1, ::2].max(axis=0)) for each in (boxes, others)
-    )
-    return bool((np.minimum(high, other_high) - np.maximum(low, other_low) > 0).all())
-
-
-def _on_feet(item: SceneObject, changes: Counter[str]) -> SceneObject:
-    standing = add_supports(item)
-    changes["given feet"] += standing is not item
-    return standing
 
 
 def _apart(scene: Scene, objects: list[SceneObject], changes: Counter[str]) -> list[SceneObject]:
@@ -152,21 +135,7 @@ def free_offset(
     still = np.zeros((1, 2))
     if not _overlaps(boxes, taken, still, -TOUCHING_M)[0]:
         return still[0]
-    steps = np.arange(-REACH_M, REACH_M + STEP_M / 2, STEP_M)
-    grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
-    tried = np.concatenate([_flush_moves(boxes, taken), grid])
-    tried = tried[np.argsort(np.abs(tried).sum(axis=1), kind="stable")]
-    outside = _area_outside(boxes, floor, still[0])
-    for some in np.array_split(tried, max(1, len(tried) // 256)):
-        for offset in some[~_overlaps(boxes, taken, some, GAP_M / 2)]:
-            if _area_outside(boxes, floor, offset) <= outside + 1e-4:
-                return np.asarray(offset)
-    return None
-
-
-def _flush_moves(boxes: Boxes, taken: Boxes) -> Float[np.ndarray, "moves 2"]:
-    """Moves along one axis after which a box is flush with a taken box."""
-    moves = []
+    moves = []  # along one axis, after which a box is flush with a taken box
     for axis in (0, 2):
         after = taken[None, :, 1, axis] - boxes[:, None, 0, axis] + GAP_M
         before = taken[None, :, 0, axis] - boxes[:, None, 1, axis] - GAP_M
@@ -174,7 +143,16 @@ def _flush_moves(boxes: Boxes, taken: Boxes) -> Float[np.ndarray, "moves 2"]:
         along = np.unique(along[np.abs(along) <= REACH_M].round(4))
         columns = [along, np.zeros_like(along)]
         moves.append(np.stack(columns if axis == 0 else columns[::-1], axis=1))
-    return np.concatenate(moves)
+    steps = np.arange(-REACH_M, REACH_M + STEP_M / 2, STEP_M)
+    grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    tried = np.concatenate([*moves, grid])
+    tried = tried[np.argsort(np.abs(tried).sum(axis=1), kind="stable")]
+    outside = _area_outside(boxes, floor, still[0])
+    for some in np.array_split(tried, max(1, len(tried) // 256)):
+        for offset in some[~_overlaps(boxes, taken, some, GAP_M / 2)]:
+            if _area_outside(boxes, floor, offset) <= outside + 1e-4:
+                return np.asarray(offset)
+    return None
 
 
 def _overlaps(
@@ -231,7 +209,7 @@ def add_supports(item: SceneObject) -> SceneObject:
         return item
     bodies = colliders(item)
     feet = _feet(bodies)
-    mesh = item.mesh and _joined(item.mesh, *map(mesh_of, feet))
+    mesh = item.mesh and join_meshes([item.mesh, *map(mesh_of, feet)])
     textured = item.textured and (*item.textured, *(Textured(mesh_of(foot)) for foot in feet))
     return replace(item, solids=(*bodies, *feet), mesh=mesh, textured=textured)
 
@@ -290,11 +268,3 @@ def _under(
         found.append((float(cost), nearest, float(lower[:, 1].max())))
     _, place, top_m = min(found, key=lambda one: one[0])
     return place, top_m
-
-
-def _joined(*meshes: Mesh) -> Mesh:
-    starts = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes)])
-    return Mesh(
-        np.concatenate([mesh.vertices_m for mesh in meshes]),
-        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]),
-    )

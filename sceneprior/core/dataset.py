@@ -52,7 +52,11 @@ class MaskStore:
         missing = sorted(set(wanted).difference(packed))
         if missing:
             path, room_id = self.rooms[room]
-            images = self._shard(path).read_instance_ids(room_id, missing, self.step)
+            shard = self._shards.pop(path, None) or Shard(path)
+            self._shards[path] = shard  # the last used stands last
+            if len(self._shards) > _OPEN_SHARDS:
+                self._shards.popitem(last=False)[1].close()
+            images = shard.read_instance_ids(room_id, missing, self.step)
             self._forms[room] = images.shape[1:], images.dtype
             for view, image in zip(missing, images, strict=True):
                 # Level 6 would save another third of the memory but take twice the time.
@@ -60,15 +64,6 @@ class MaskStore:
         shape, dtype = self._forms[room]
         plain = b"".join(zlib_ng.decompress(packed[view]) for view in wanted)
         return np.frombuffer(plain, dtype).reshape(-1, *shape)
-
-    def _shard(self, path: Path) -> Shard:
-        if path in self._shards:
-            self._shards.move_to_end(path)
-        else:
-            self._shards[path] = Shard(path)
-            if len(self._shards) > _OPEN_SHARDS:
-                self._shards.popitem(last=False)[1].close()
-        return self._shards[path]
 
 
 class RoomDataset(Dataset):

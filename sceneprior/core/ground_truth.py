@@ -100,25 +100,17 @@ def shuffled_rooms(
     places = [item.center_m for scene in real for item in scene.objects]
     rooms: list[Scene] = []
     for row in generator.permutation(len(real))[:count]:
-        chosen = generator.integers(len(places), size=len(real[row].objects))
-        objects = tuple(
-            _at(item, *places[pick][::2])
-            for item, pick in zip(real[row].objects, chosen, strict=True)
-        )
+        like = real[row] if with_meshes else real[row].without_meshes()
+        chosen = generator.integers(len(places), size=len(like.objects))
+        objects = []
+        for item, pick in zip(like.objects, chosen, strict=True):
+            center_m = (places[pick][0], item.center_m[1], places[pick][2])
+            objects.append(replace(item.in_box(center_m, item.size_m), turned=item.turned))
+        name = f"shuffled_{len(rooms):04d}"
         rooms.append(
-            Scene(
-                f"shuffled_{len(rooms):04d}",
-                real[row].label_set,
-                objects,
-                real[row].floor_m,
-                ceiling_m=real[row].ceiling_m,
-            )
+            Scene(name, like.label_set, tuple(objects), like.floor_m, ceiling_m=like.ceiling_m)
         )
-    return rooms if with_meshes else [room.without_meshes() for room in rooms]
-
-
-def _at(item: SceneObject, x: float, z: float) -> SceneObject:
-    return replace(item.in_box((x, item.center_m[1], z), item.size_m), turned=item.turned)
+    return rooms
 
 
 def reference_scene(

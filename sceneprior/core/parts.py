@@ -55,14 +55,11 @@ class Parts(NamedTuple):
             copies = [ends]
             for bit, axis in ((ACROSS_X, 0), (ACROSS_Z, 2)):
                 if mirrored & bit:
-                    copies += [_across(each, axis) for each in copies]
+                    others = [each.copy() for each in copies]
+                    for other in others:
+                        other[axis] = -other[axis, ::-1]
+                    copies += others
             yield from ((int(kind), each) for each in copies)
-
-
-def _across(ends: Float[np.ndarray, "3 2"], axis: int) -> Float[np.ndarray, "3 2"]:
-    other = ends.copy()
-    other[axis] = -ends[axis, ::-1]
-    return other
 
 
 def whole_box() -> Parts:
@@ -134,7 +131,10 @@ def surface_of_parts(
     """
     from manifold3d import Manifold, OpType  # imported here: reading a scene does not need it
 
-    solids = [_solid(kind, ends) for kind, ends in parts.solids()]
+    grown = np.array([-OVERLAP, OVERLAP])
+    solids = [
+        Manifold.hull_points(solid_points(kind, ends + grown)) for kind, ends in parts.solids()
+    ]
     united: Manifold = Manifold.batch_boolean(solids, OpType.Add)
     if not np.array_equal(parts.outline, SQUARE):
         united = united ^ prism(parts.outline, -1.0, 1.0)
@@ -168,12 +168,6 @@ def prism(outline: Float[np.ndarray, "corners 2"], low: float, high: float) -> "
     # Extruded along its third axis, which becomes y.
     to_room = np.array([[1, 0, 0, 0], [0, 0, 1, low], [0, 1, 0, 0]])
     return flat.extrude(high - low).transform(to_room)
-
-
-def _solid(kind: int, ends: Float[np.ndarray, "3 2"]) -> "Manifold":
-    from manifold3d import Manifold
-
-    return Manifold.hull_points(solid_points(kind, ends + np.array([-OVERLAP, OVERLAP])))
 
 
 def solid_points(kind: int, ends: Float[np.ndarray, "3 2"]) -> Float[np.ndarray, "points 3"]:

@@ -1,6 +1,5 @@
 """Proxies of objects: template spheres, beveled cubes, and ellipsoids with exact 2D boxes."""
 
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,18 +12,13 @@ from sceneprior.core.boxes import CUBE_CORNERS
 from sceneprior.core.cameras import MIN_DEPTH_M, Boxes2D
 
 
-@lru_cache
-def _icosphere(level: int) -> tuple[np.ndarray, np.ndarray]:
+def icosphere(level: int) -> tuple[Float[Tensor, "vertices 3"], Int[Tensor, "faces 3"]]:
+    """Make a unit icosphere of 20 * 4**level outward triangles; the authors use level 4."""
     import trimesh
 
     sphere = trimesh.creation.icosphere(subdivisions=level)
-    return np.asarray(sphere.vertices), np.asarray(sphere.faces)
-
-
-def icosphere(level: int) -> tuple[Float[Tensor, "vertices 3"], Int[Tensor, "faces 3"]]:
-    """Make a unit icosphere of 20 * 4**level outward triangles; the authors use level 4."""
-    vertices, faces = _icosphere(level)
-    return torch.tensor(vertices, dtype=torch.float32), torch.tensor(faces, dtype=torch.int64)
+    vertices = torch.tensor(np.asarray(sphere.vertices), dtype=torch.float32)
+    return vertices, torch.tensor(np.asarray(sphere.faces), dtype=torch.int64)
 
 
 def to_cube(sphere: Float[Tensor, "vertices 3"]) -> Float[Tensor, "vertices 3"]:

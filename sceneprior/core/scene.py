@@ -56,6 +56,13 @@ def mesh_of_file(vertices_m: np.ndarray, faces: np.ndarray) -> Mesh:
     return mesh
 
 
+def join_meshes(meshes: Sequence[Mesh]) -> Mesh:
+    """All meshes as one, in their order; no vertices are merged."""
+    starts = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes)])
+    faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
+    return Mesh(np.concatenate([mesh.vertices_m for mesh in meshes]), np.concatenate(faces))
+
+
 class Textured(NamedTuple):
     """A part of an object's mesh that has one material."""
 

@@ -168,7 +168,17 @@ def read_scene(path: Path) -> Scene:
 def read_object(path: Path | str, item: ObjectEntry) -> SceneObject:
     """An object of a file; its boxes are checked, its class is not."""
     check_box(path, item.label, item.center_m, item.size_m)
-    turned = _turned_of(path, item)
+    turned = None
+    if item.yaw_rad is not None and item.own_size_m is not None:
+        check_box(path, item.label, item.center_m, item.own_size_m)
+        turned = Turned(item.yaw_rad, item.own_size_m, item.yaw_confidence)
+    one = item.yaw_rad is not None or item.own_size_m is not None
+    if one and not (turned and np.allclose(bound_m(turned), item.size_m, rtol=0, atol=1e-3)):
+        raise InputError(
+            f"{path}: a {item.label} of size_m {item.size_m} has yaw_rad {item.yaw_rad} and "
+            f"own_size_m {item.own_size_m}; expected both, such that the box turned by yaw_rad "
+            "fills size_m, or neither."
+        )
     solids = tuple(Solid(**solid.model_dump()) for solid in item.solids)
     check_solids(path, item.label, item.center_m, item.size_m, solids)
     return SceneObject(item.label, item.center_m, item.size_m, turned=turned, solids=solids)
@@ -246,22 +256,6 @@ def unit_guess(numbers: Any) -> str:
     """Question about the unit, for messages about lengths that are too large for metres."""
     unit = "millimetres" if np.abs(numbers).max() > 1000 else "centimetres"
     return f"Are these {unit}? Give metres."
-
-
-def _turned_of(path: Path | str, item: ObjectEntry) -> Turned | None:
-    """Oriented box of an entry, if it has one; it must fill the axis-aligned box."""
-    if item.yaw_rad is None and item.own_size_m is None:
-        return None
-    if item.yaw_rad is not None and item.own_size_m is not None:
-        check_box(path, item.label, item.center_m, item.own_size_m)
-        turned = Turned(item.yaw_rad, item.own_size_m, item.yaw_confidence)
-        if np.allclose(bound_m(turned), item.size_m, rtol=0, atol=1e-3):
-            return turned
-    raise InputError(
-        f"{path}: a {item.label} of size_m {item.size_m} has yaw_rad {item.yaw_rad} and "
-        f"own_size_m {item.own_size_m}; expected both, such that the box turned by yaw_rad fills "
-        "size_m, or neither."
-    )
 
 
 def _short(text: object) -> str:

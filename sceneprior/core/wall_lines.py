@@ -141,7 +141,9 @@ def find_walls(
     Lines are found one after another, each where most points lie (a Hough transform), and fitted to
     the points near them. Walls may have any direction.
     """
-    edges = _edges(room, range(len(room.world_to_camera)) if views is None else views)
+    views = range(len(room.world_to_camera)) if views is None else views
+    every = zip(*(_edges_of_view(room, int(view)) for view in views), strict=True)
+    edges = _Edges(*(np.concatenate(part) for part in every))
     edges = edges.take(slice(None, None, max(1, len(edges.view) // _MOST_POINTS)))
     walls: list[Wall] = []
     doors: list[Door] = []
@@ -154,12 +156,6 @@ def find_walls(
         doors += _doors(edges.take(on), line)
         edges = edges.take(~line.has(edges, _ERROR_PX))
     return tuple(walls), tuple(doors)
-
-
-def _edges(room: RoomViews, views: Sequence[int] | np.ndarray) -> _Edges:
-    """Collect the points of some views."""
-    parts = [_edges_of_view(room, int(view)) for view in views]
-    return _Edges(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
 def _edges_of_view(room: RoomViews, view: int) -> _Edges:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sceneprior.core.scene import Mesh, Textured, mesh_of_file
+from sceneprior.core.scene import Mesh, Textured, join_meshes, mesh_of_file
 from sceneprior.render.appearance import linear_rgba
 
 LARGEST_PX = 1024
@@ -47,11 +47,7 @@ def load_parts(
 def joined(parts: Iterable[Textured]) -> Mesh:
     """Join parts into one closed mesh. Files repeat vertices along the seams of textures, which
     opens closed meshes, so such vertices are merged."""
-    meshes = [_without_seams(part.mesh) for part in parts]
-    starts = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes)])
-    faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
-    vertices = np.concatenate([mesh.vertices_m for mesh in meshes])
-    return _without_seams(Mesh(vertices, np.concatenate(faces)))
+    return _without_seams(join_meshes([_without_seams(part.mesh) for part in parts]))
 
 
 def _without_seams(mesh: Mesh) -> Mesh:
