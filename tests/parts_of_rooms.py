@@ -4,8 +4,7 @@ import numpy as np
 
 from sceneprior.core.parts import ACROSS_X, ACROSS_Z, BOX, Parts
 from sceneprior.lifted.lifting import RayPool
-from sceneprior.lifted.lifting.part_rays import meets
-from sceneprior.lifted.lifting.part_regularizers import LEVELS
+from sceneprior.lifted.lifting.part_rays import LEVELS, meets
 
 
 def boxes(*ends, mirrored=()) -> Parts:

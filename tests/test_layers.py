@@ -80,7 +80,7 @@ OWNERS = {
     "typer": ["sceneprior/apps/cli/", "data_prep/cli.py"],
     "jinja2": ["sceneprior/evaluation/"],
     "efficientnet_lite_pytorch": ["sceneprior/evaluation/"],
-    "skimage": ["sceneprior/core/surfaces", "sceneprior/lifted/lifting/part_regularizers"],
+    "skimage": ["sceneprior/core/surfaces", "sceneprior/lifted/lifting/part_loss"],
     "manifold3d": ["sceneprior/core/parts.py", "sceneprior/core/shell.py"],
     "fast_simplification": ["sceneprior/core/surfaces.py"],
     "sklearn": ["sceneprior/evaluation/", "sceneprior/lifted/sampler/prototype_statistics"],

@@ -7,11 +7,9 @@ closed, and the parts become one piece that neither floats nor tips over.
 
 import itertools
 from collections.abc import Iterator
-from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Int
-from numba import njit
 from scipy import ndimage
 
 from sceneprior.core.parts import (
@@ -26,8 +24,8 @@ from sceneprior.core.parts import (
     Parts,
 )
 from sceneprior.lifted.lifting import RayPool
-from sceneprior.lifted.lifting.part_loss import Change, Guess, RayFit
-from sceneprior.lifted.lifting.part_regularizers import LEVELS, outline_of
+from sceneprior.lifted.lifting.part_loss import Change, Guess, Part, RayFit, outline_of
+from sceneprior.lifted.lifting.part_rays import LEVELS
 
 CURVED = (CYLINDER, ELLIPSOID, DOME, BOWL)
 LEAST_GAIN = 1e-4
@@ -47,9 +45,7 @@ SLIT, SLIT_LOSS = 8, 0.002
 """Width in levels up to which a slit is closed, and the increase of the loss up to which it is."""
 
 
-def fit_parts(
-    rays: RayPool, hull: Bool[np.ndarray, "x y z"], margin: float, hangs: bool = False
-) -> Parts:
+def fit_parts(rays: RayPool, hull: Bool[np.ndarray, "x y z"], margin: float, hangs: bool) -> Parts:
     """Fit parts to the rays of one object, or of several similar objects.
 
     Args:
@@ -70,7 +66,7 @@ def fit_parts(
     some = RayFit(RayPool(*(part[:SCREENED] for part in rays)), margin, outline, hangs)
     while better := _one_more(every, some, guess, hull) or _one_more(every, every, guess, hull):
         guess = better
-    return _needed(every, repair(every, close_slits(every, guess))).parts(outline)
+    return _needed(every, _repaired(every, _close_slits(every, guess))).parts(outline)
 
 
 def _one_more(
@@ -86,9 +82,7 @@ def _one_more(
         # Curved parts would take ten times as long.
         if all(kind == BOX for kind, _, _ in change.values()):
             trial = some.refined(trial, change, 1)
-        parts = zip(trial.kinds.tolist(), trial.mirrored.tolist(), trial.ends, strict=True)
-        refined = {row: part for row, part in enumerate(parts) if row in change}
-        tried.append((some.loss(trial), refined))
+        tried.append((some.loss(trial), {row: trial.part(row) for row in change}))
     best, least = None, every.loss(guess) - LEAST_GAIN
     for _, change in sorted(tried, key=lambda each: each[0])[:FINALISTS]:
         trial = every.refined(every.changed(guess, change), change, 2)
@@ -106,9 +100,9 @@ def _changes(
     new = len(guess.kinds)
     room = new < MOST_PARTS
     for row in range(new):
-        across, ends = int(guess.mirrored[row]), guess.ends[row]
+        own_kind, across, ends = guess.part(row)
         if curved:
-            yield from ({row: (kind, across, ends)} for kind in CURVED if kind != guess.kinds[row])
+            yield from ({row: (kind, across, ends)} for kind in CURVED if kind != own_kind)
         for axis, bit in enumerate((ACROSS_X, 0, ACROSS_Z)):
             low, high = ends[axis]
             if high - low < SHORTEST:
@@ -118,7 +112,7 @@ def _changes(
                 narrow = ends.copy()
                 narrow[axis, 1] = low + (high - low) // 4
                 yield {row: (BOX, across | bit, narrow)}
-                yield {row: (int(guess.kinds[row]), across | bit, ends)}
+                yield {row: (own_kind, across | bit, ends)}
             for share in PLACES if room else ():
                 one, other = ends.copy(), ends.copy()
                 one[axis, 1] = other[axis, 0] = low + round(share * (high - low))
@@ -127,49 +121,35 @@ def _changes(
                 if single and share < 0.5:
                     yield {row: (BOX, across | bit, one), new: (BOX, across, other)}
         if ends[1, 0] > 0:
-            yield extended_down(guess, row)
+            yield _extended_down(guess, row)
         if room and (LEVELS - ends[1, 1] if hangs else ends[1, 0]) >= SHORTEST:
-            yield from ({new: (BOX, *each)} for each in supports(ends, hangs))
-    labels, pieces = ndimage.label(hull & ~_cells_in(guess, len(hull)))
+            yield from ({new: each} for each in _supports(ends, hangs))
+    uncovered, cells = hull.copy(), len(hull)
+    for _, ends in guess.parts().solids():
+        first, last = np.rint((ends.T + 0.5) * cells).astype(int)
+        uncovered[first[0] : last[0], first[1] : last[1], first[2] : last[2]] = False
+    labels, pieces = ndimage.label(uncovered)
     if not pieces or not room:
         return
     boxes = ndimage.find_objects(labels)
     for piece in np.argsort(-np.bincount(labels.ravel())[1:], kind="stable")[:PIECES]:
-        own = np.array([[side.start, side.stop] for side in boxes[piece]]) * LEVELS // len(hull)
+        own = np.array([[side.start, side.stop] for side in boxes[piece]]) * LEVELS // cells
         for across in (0, ACROSS_X, ACROSS_Z, ACROSS_X | ACROSS_Z):
             yield {new: (BOX, across, own)}
 
 
-# no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.
-@njit(cache=True, nogil=True)
-@no_type_check
-def _extents_of(hull, ends):
+def _extents_of(
+    hull: Bool[np.ndarray, "x y z"], ends: Int[np.ndarray, "3 2"]
+) -> Int[np.ndarray, "3 2"]:
     """The bounding box of the hull's cells in a box; the box itself if it has none."""
     cells = len(hull)
     first, last = ends[:, 0] * cells // LEVELS, -(-ends[:, 1] * cells // LEVELS)
-    low, high = last.copy(), first - 1
-    for x in range(first[0], last[0]):
-        for y in range(first[1], last[1]):
-            for z in range(first[2], last[2]):
-                if hull[x, y, z]:
-                    low[0], high[0] = min(low[0], x), max(high[0], x)
-                    low[1], high[1] = min(low[1], y), max(high[1], y)
-                    low[2], high[2] = min(low[2], z), max(high[2], z)
-    found = ends.copy()
-    if high[0] >= low[0]:
-        for axis in range(3):
-            found[axis, 0] = max(ends[axis, 0], low[axis] * LEVELS // cells)
-            found[axis, 1] = min(ends[axis, 1], -(-(high[axis] + 1) * LEVELS // cells))
-    return found
-
-
-def _cells_in(guess: Guess, cells: int) -> Bool[np.ndarray, "x y z"]:
-    """True for cells, of a grid over the object's box, in the box of some part."""
-    found = np.zeros((cells,) * 3, bool)
-    for _, ends in guess.parts().solids():
-        first, last = np.rint((ends.T + 0.5) * cells).astype(int)
-        found[first[0] : last[0], first[1] : last[1], first[2] : last[2]] = True
-    return found
+    found = np.argwhere(hull[tuple(itertools.starmap(slice, zip(first, last, strict=True)))])
+    if not len(found):
+        return ends
+    low = (first + found.min(axis=0)) * LEVELS // cells
+    high = -(-(first + found.max(axis=0) + 1) * LEVELS // cells)
+    return np.stack([np.maximum(ends[:, 0], low), np.minimum(ends[:, 1], high)], axis=1)
 
 
 def _needed(every: RayFit, guess: Guess) -> Guess:
@@ -178,72 +158,59 @@ def _needed(every: RayFit, guess: Guess) -> Guess:
     while row < len(guess.kinds) > 1:
         trial = every.without(guess, row)
         cheaper = every.loss(trial) < every.loss(guess)
-        if cheaper and faults_of(every, trial) <= faults_of(every, guess):
+        if cheaper and every.faults(trial) <= every.faults(guess):
             guess, row = trial, 0
         else:
             row += 1
     return guess
 
 
-def close_slits(every: RayFit, guess: Guess) -> Guess:
+def _close_slits(every: RayFit, guess: Guess) -> Guess:
     """The guess without narrow slits between a part and its mirror image, unless rays show them."""
     for row in range(len(guess.kinds)):
         for axis, bit in ((0, ACROSS_X), (2, ACROSS_Z)):
-            low, high = guess.ends[row, axis]
+            kind, across, ends = guess.part(row)
+            low, high = ends[axis]
             slit = max(LEVELS - 2 * high, 2 * low - LEVELS)
-            if guess.mirrored[row] & bit and 0 < slit <= SLIT:
-                joined = guess.ends[row].copy()
-                joined[axis] = _with_image(joined[axis])
-                across = int(guess.mirrored[row]) & ~bit
-                trial = every.changed(guess, {row: (int(guess.kinds[row]), across, joined)})
+            if across & bit and 0 < slit <= SLIT:
+                joined = ends.copy()
+                joined[axis] = _with_image(ends[axis])
+                trial = every.changed(guess, {row: (kind, across & ~bit, joined)})
                 if every.loss(trial) < every.loss(guess) + SLIT_LOSS:
                     guess = trial
     return guess
 
 
-def repair(every: RayFit, guess: Guess) -> Guess:
+def _repaired(every: RayFit, guess: Guess) -> Guess:
     """The guess as one piece that stands on the floor without tipping over or, if it hangs, reaches
     the ceiling, whatever that costs. Masks often miss thin cords and legs, but nothing floats. Each
-    step adds a bar or supports, or mirrors or removes a part; the cheapest step that mends
+    step adds a bar or supports, or extends, mirrors or removes a part; the cheapest step that mends
     something is taken."""
-    while faults := faults_of(every, guess):
+    hangs = every.hangs
+    while faults := every.faults(guess):
         new = len(guess.kinds)
         trials = [every.without(guess, row) for row in range(new) if new > 1]
-        changes = _repairs(guess, every.hangs) if new < MOST_PARTS else ()
-        trials += [every.changed(guess, change) for change in changes]
-        mended = [each for each in trials if faults_of(every, each) < faults]
+        changes: list[Change] = [{new: bar} for bar in _bars(guess, hangs)]
+        for row in range(new):
+            kind, across, ends = guess.part(row)
+            if ends[1, 1] < LEVELS if hangs else ends[1, 0] > 0:
+                changes += [{new: each} for each in _supports(ends, hangs)]
+                if not hangs:
+                    changes.append(_extended_down(guess, row))
+            elif not hangs:
+                changes += [{row: (kind, across | bit, ends)} for bit in (ACROSS_X, ACROSS_Z)]
+        trials += [every.changed(guess, change) for change in changes if new < MOST_PARTS]
+        mended = [each for each in trials if every.faults(each) < faults]
         if not mended:
             break
         guess = min(mended, key=every.loss)
     return guess
 
 
-def faults_of(every: RayFit, guess: Guess) -> int:
-    """Number of pieces beyond one, one more for a gap to the floor or the ceiling, and one more for
-    an overhang."""
-    gap, pieces = every.gap_and_pieces(guess)
-    return abs(pieces - 1) + (gap > 0) + (every.overhang(guess) > 0)
-
-
-def _repairs(guess: Guess, hangs: bool) -> Iterator[Change]:
-    """Bars and supports, and for an object that stands also parts extended to the floor, and
-    mirrored feet."""
-    new = len(guess.kinds)
-    yield from ({new: (BOX, *bar)} for bar in _bars(guess, hangs))
-    for row, ends in enumerate(guess.ends):
-        if ends[1, 1] < LEVELS if hangs else ends[1, 0] > 0:
-            yield from ({new: (BOX, *each)} for each in supports(ends, hangs))
-            if not hangs:
-                yield extended_down(guess, row)
-        elif not hangs:
-            kind, across = int(guess.kinds[row]), int(guess.mirrored[row])
-            yield from ({row: (kind, across | bit, ends)} for bit in (ACROSS_X, ACROSS_Z))
-
-
-def _bars(guess: Guess, hangs: bool) -> Iterator[tuple[int, Int[np.ndarray, "3 2"]]]:
+def _bars(guess: Guess, hangs: bool) -> Iterator[Part]:
     """Boxes that connect each part to each other part and, for an object that hangs, to the
-    ceiling: as wide as the overlap of the two, and two levels wide. Each comes with its mirroring.
-    None stands on the floor: an object on a thin post would tip over."""
+    ceiling: as wide as the overlap of the two, and two levels wide. None stands on the floor: an
+    object on a thin post would tip over."""
     ceiling = np.array([[0, LEVELS]] * 3)
     ceiling[1] = LEVELS
     both = ACROSS_X | ACROSS_Z
@@ -266,20 +233,18 @@ def _bars(guess: Guess, hangs: bool) -> Iterator[tuple[int, Int[np.ndarray, "3 2
         for low, high in (between, narrow):
             bar = np.stack([low, np.maximum(high, low + 1)], axis=1).clip(0, LEVELS)
             if (bar[:, 0] < bar[:, 1]).all():
-                yield one & other, bar
+                yield BOX, one & other, bar
 
 
-def supports(
-    ends: Int[np.ndarray, "3 2"], hangs: bool
-) -> Iterator[tuple[int, Int[np.ndarray, "3 2"]]]:
-    """Supports of a part, each as mirroring and ends: four legs, two side panels, or a front and a
-    back panel on the floor; for an object that hangs, a cord from the middle to the ceiling."""
+def _supports(ends: Int[np.ndarray, "3 2"], hangs: bool) -> Iterator[Part]:
+    """Supports of a part: four legs, two side panels, or a front and a back panel on the floor; for
+    an object that hangs, a cord from the middle to the ceiling."""
     if hangs:
         cord = ends.copy()
         middle = ends.sum(axis=1) // 2
         cord[::2] = np.stack([middle - 1, middle + 1], axis=1)[::2]
         cord[1] = ends[1, 1], LEVELS
-        yield 0, cord
+        yield BOX, 0, cord
         return
     under = ends.copy()
     under[1] = 0, ends[1, 0]
@@ -287,14 +252,15 @@ def supports(
         leg = under.copy()
         for axis in axes:
             leg[axis, 1] = min(leg[axis, 0] + SUPPORT, ends[axis, 1])
-        yield across, leg
+        yield BOX, across, leg
 
 
-def extended_down(guess: Guess, row: int) -> Change:
+def _extended_down(guess: Guess, row: int) -> Change:
     """The change that extends a part to the floor."""
-    down = guess.ends[row].copy()
+    kind, across, ends = guess.part(row)
+    down = ends.copy()
     down[1, 0] = 0
-    return {row: (int(guess.kinds[row]), int(guess.mirrored[row]), down)}
+    return {row: (kind, across, down)}
 
 
 def _with_image(ends: Int[np.ndarray, "2"]) -> tuple[int, int]:

@@ -1,4 +1,4 @@
-"""Intersections of rays with parts, and coordinate descent of the faces of parts.
+"""Intersections of rays with parts and outlines, and coordinate descent of the faces of parts.
 
 Faces lie on `LEVELS` + 1 evenly spaced levels between the sides of the object's box, so that one
 pass over the rays computes the costs of all levels of a face, exactly and in integers.
@@ -10,15 +10,61 @@ import numpy as np
 from numba import njit
 
 from sceneprior.core.parts import ACROSS_X, ACROSS_Z, BOWL, BOX, CYLINDER, DOME
-from sceneprior.lifted.lifting.part_regularizers import LEVELS, planes_of, volume_of, within
 
+LEVELS = 64
+"""Number of intervals between the levels on which faces lie."""
 FAR = 1e6
 """A level beyond all rays."""
 NEVER = 1 << 20
 """Threshold of rays that miss the box at every level of the face."""
+NEARBY = (0, -4, 4, -2, 2, -1, 1)
+"""Steps in levels that are tried for a face of a curved part."""
 
 
 # no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def within(start, span, outline):
+    """Shares of a segment's length, from `start` to `start` + `span`, at which the segment first
+    enters and last leaves the prism over an outline; (1, 0) if it never meets the prism."""
+    near, far = 1.0, 0.0
+    first, last = False, False  # whether the segment's ends lie inside
+    corners = len(outline)
+    for corner in range(corners):
+        x1, z1 = outline[corner - 1 if corner else corners - 1]
+        x2, z2 = outline[corner]
+        edge_x, edge_z = x2 - x1, z2 - z1
+        for end in range(2):
+            x, z = start[0] + end * span[0], start[2] + end * span[2]
+            if (z1 > z) != (z2 > z) and x < x1 + (z - z1) / edge_z * edge_x:
+                if end:
+                    last = not last
+                else:
+                    first = not first
+        across = span[0] * edge_z - span[2] * edge_x
+        if across == 0:
+            continue
+        from_x, from_z = x1 - start[0], z1 - start[2]
+        along = (from_x * edge_z - from_z * edge_x) / across
+        on_edge = (from_x * span[2] - from_z * span[0]) / across
+        if 0 <= along <= 1 and 0 <= on_edge <= 1:
+            near, far = min(near, along), max(far, along)
+    return 0.0 if first else near, 1.0 if last else far
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def cut_rays(starts, spans, outline):
+    """Shorten segments, in place, to the range between their first and last point within an
+    outline. Segments without such a point get a span of 0. In an outline with a notch, this range
+    may include points outside."""
+    for ray in range(len(starts)):
+        near, far = within(starts[ray], spans[ray], outline)
+        for axis in range(3):
+            starts[ray, axis] += near * spans[ray, axis]
+            spans[ray, axis] *= max(far - near, 0.0)
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def _meets_solid(start, span, kind, low, high):
@@ -76,6 +122,39 @@ def meets(starts, spans, kind, mirrored, ends, met):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
+def volume_of(kind, mirrored, ends):
+    """Volume of a part and its mirror images, as a share of the object's box."""
+    copies = (2 if mirrored & ACROSS_X else 1) * (2 if mirrored & ACROSS_Z else 1)
+    share = 1.0
+    for axis in range(3):
+        share *= (ends[axis, 1] - ends[axis, 0]) / LEVELS
+    if kind == CYLINDER:
+        share *= np.pi / 4
+    elif kind != BOX:
+        share *= np.pi / 6
+    return copies * share
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def planes_of(ends, skipped):
+    """True for the planes, by axis and level, that contain a face of any part but `skipped`, and
+    across x and z for their mirror images. The sides of the box are always true."""
+    used = np.zeros((3, LEVELS + 1), np.bool_)
+    used[:, 0] = True
+    used[:, LEVELS] = True
+    for part in range(len(ends)):
+        if part != skipped:
+            for axis in range(3):
+                for end in range(2):
+                    used[axis, ends[part, axis, end]] = True
+                    if axis != 1:
+                        used[axis, LEVELS - ends[part, axis, end]] = True
+    return used
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
 def _face_costs(
     starts, inverse, hits, others, mirrored, ends, axis, upper, hit_price, miss_price, costs
 ):  # fmt: skip
@@ -108,15 +187,12 @@ def _face_costs(
         if others[ray] > 0:
             continue
         threshold = NEVER
-        x, y, z = starts[ray, 0], starts[ray, 1], starts[ray, 2]
-        along_x, along_y, along_z = inverse[ray, 0], inverse[ray, 1], inverse[ray, 2]
         for copy in range(copies):
-            one, other = (lows[copy, 0] - x) * along_x, (highs[copy, 0] - x) * along_x
-            near, far = max(0.0, min(one, other)), min(1.0, max(one, other))
-            one, other = (lows[copy, 1] - y) * along_y, (highs[copy, 1] - y) * along_y
-            near, far = max(near, min(one, other)), min(far, max(one, other))
-            one, other = (lows[copy, 2] - z) * along_z, (highs[copy, 2] - z) * along_z
-            near, far = max(near, min(one, other)), min(far, max(one, other))
+            near, far = 0.0, 1.0
+            for side in range(3):
+                one = (lows[copy, side] - starts[ray, side]) * inverse[ray, side]
+                other = (highs[copy, side] - starts[ray, side]) * inverse[ray, side]
+                near, far = max(near, min(one, other)), min(far, max(one, other))
             if near > far:
                 continue
             start, span = starts[ray, axis], 1 / inverse[ray, axis]
@@ -147,10 +223,10 @@ def descend(
 
     `covered` is true where a part meets a ray, and `count` is the number of parts that each ray
     meets; both are updated. The prices are those of a hit that no part meets, of a miss that one
-    meets, of filling the whole box, and of a face in a new plane (`count_planes`). A box tries all
+    meets, of filling the whole box, and of a face in a new plane (`planes_of`). A box tries all
     levels of a face, a curved part only those nearby: its faces are not independent.
     """
-    costs = np.empty(LEVELS + 1)
+    costs = np.zeros(LEVELS + 1)
     others = np.empty(len(hits), np.int16)
     met = np.empty(len(hits), np.bool_)
     for _ in range(sweeps):
@@ -162,44 +238,40 @@ def descend(
             used = planes_of(ends, part)
             changed = False
             for face in range(6):
-                axis, upper = face // 2, face % 2 == 1
-                before = own[axis, 1 if upper else 0]
-                best = before
-                first, last = (own[axis, 0] + 1, LEVELS) if upper else (0, own[axis, 1] - 1)
+                axis, side = face // 2, face % 2
+                before = best = own[axis, side]
+                first, last = (own[axis, 0] + 1, LEVELS) if side else (0, own[axis, 1] - 1)
                 if kind == BOX:
                     _face_costs(
-                        starts, inverse, hits, others, mirror, own, axis, upper, hit_price,
+                        starts, inverse, hits, others, mirror, own, axis, side == 1, hit_price,
                         miss_price, costs,
                     )  # fmt: skip
-                    least = np.inf
-                    for place in range(first, last + 1):
-                        own[axis, 1 if upper else 0] = place
-                        cost = costs[place] + volume_price * volume_of(kind, mirror, own)
-                        if not used[axis, place]:
-                            cost += plane_price
-                        # Ties: the current level first, then the first level tried.
-                        if cost < least - 1e-12 or (cost < least + 1e-12 and place == before):
-                            least, best = cost, place
-                else:
-                    least = np.inf
-                    for step in (0, -4, 4, -2, 2, -1, 1):
-                        place = before + step
-                        if place < first or place > last:
-                            continue
-                        own[axis, 1 if upper else 0] = place
+                least = np.inf
+                # Ties: the current level first, then the first level tried.
+                for trial in range(LEVELS + 2 if kind == BOX else len(NEARBY)):
+                    if kind == BOX:
+                        place = trial - 1 if trial else before
+                    else:
+                        place = before + NEARBY[trial]
+                    if place < first or place > last:
+                        continue
+                    own[axis, side] = place
+                    cost = volume_price * volume_of(kind, mirror, own)
+                    if kind == BOX:
+                        cost += costs[place]
+                    if not used[axis, place]:
+                        cost += plane_price
+                    if kind != BOX:
                         meets(starts, spans, kind, mirror, own, met)
-                        cost = volume_price * volume_of(kind, mirror, own)
-                        if not used[axis, place]:
-                            cost += plane_price
                         for ray in range(len(hits)):
                             if others[ray] == 0:
                                 if met[ray] and not hits[ray]:
                                     cost += miss_price
                                 elif hits[ray] and not met[ray]:
                                     cost += hit_price
-                        if cost < least - 1e-12:
-                            least, best = cost, place
-                own[axis, 1 if upper else 0] = best
+                    if cost < least - 1e-12:
+                        least, best = cost, place
+                own[axis, side] = best
                 changed |= best != before
             if changed:
                 moved = True

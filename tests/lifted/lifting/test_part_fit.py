@@ -8,21 +8,24 @@ from parts_of_rooms import CORNER, TABLE, boxes, rays_of
 from sceneprior.core.parts import (
     CYLINDER,
     MOST_CORNERS,
+    SQUARE,
     Parts,
     filled_cells,
     surface_of_parts,
 )
 from sceneprior.lifted.lifting import RayPool
 from sceneprior.lifted.lifting.part_fit import fit_parts
-from sceneprior.lifted.lifting.part_loss import RayFit
-from sceneprior.lifted.lifting.part_regularizers import area_table, gap_and_pieces, overhang
+from sceneprior.lifted.lifting.part_loss import RayFit, area_table, stability
 
 MARGIN, CELLS = 1.1, 32
 
 
-def found_again(parts: Parts, hull=None):
-    hull = filled_cells(parts, CELLS, MARGIN) if hull is None else hull
-    found = fit_parts(rays_of(parts, 4000), hull, MARGIN)
+def fitted(parts: Parts, hangs: bool = False) -> Parts:
+    return fit_parts(rays_of(parts, 4000), filled_cells(parts, CELLS, MARGIN), MARGIN, hangs)
+
+
+def found_again(parts: Parts):
+    found = fitted(parts)
     ours, true = (filled_cells(each, 64, 1.0) for each in (found, parts))
     return found, (ours & true).sum() / (ours | true).sum()
 
@@ -33,32 +36,28 @@ def test_furniture_is_found_again_in_as_few_parts(parts, most):
     assert iou > 0.9 and len(found.kind) <= most
 
 
+def stability_of(found: Parts, hangs: bool) -> tuple[int, int, float]:
+    levels = np.rint((found.ends + 0.5) * 64).astype(np.int64)
+    return stability(found.mirrored, levels, area_table(found.outline, 64), hangs)
+
+
 def test_what_hangs_reaches_the_ceiling_and_what_stands_the_floor():
     shade = boxes((8, 56, 20, 36, 8, 56))
-    hull = filled_cells(shade, CELLS, MARGIN)
     for hangs in (False, True):
-        found = fit_parts(rays_of(shade, 4000), hull, MARGIN, hangs)
+        found = fitted(shade, hangs)
         heights = np.stack([ends[1] for _, ends in found.solids()])
         assert heights.max() == 0.5 if hangs else heights.min() == -0.5
-        assert pieces_of(found, hangs) == (0, 1)
-
-
-def pieces_of(found: Parts, hangs: bool) -> tuple[int, int]:
-    levels = np.rint((found.ends + 0.5) * 64).astype(np.int64)
-    return gap_and_pieces(found.mirrored, levels, area_table(found.outline, 64), hangs)
+        assert stability_of(found, hangs)[:2] == (0, 1)
 
 
 def test_nothing_floats():
     """Masks show two mattresses of a bunk bed, but no posts; a lamp and its cap, but no cord."""
-    bunks = boxes((0, 64, 8, 20, 0, 64), (0, 64, 48, 64, 0, 64))
-    hull = filled_cells(bunks, CELLS, MARGIN)
-    found = fit_parts(rays_of(bunks, 4000), hull, MARGIN)
-    assert pieces_of(found, False) == (0, 1)
+    found = fitted(boxes((0, 64, 8, 20, 0, 64), (0, 64, 48, 64, 0, 64)))
+    assert stability_of(found, False)[:2] == (0, 1)
     filled = filled_cells(found, 64, 1.0)
     assert filled[:, 14].mean() > 0.9 and filled[:, 34].mean() < 0.05, "posts, not a block"
-    lamp = boxes((0, 64, 0, 20, 0, 64), (24, 40, 60, 64, 24, 40))
-    found = fit_parts(rays_of(lamp, 4000), filled_cells(lamp, CELLS, MARGIN), MARGIN, hangs=True)
-    assert pieces_of(found, True) == (0, 1)
+    found = fitted(boxes((0, 64, 0, 20, 0, 64), (24, 40, 60, 64, 24, 40)), hangs=True)
+    assert stability_of(found, True)[:2] == (0, 1)
     assert filled_cells(found, 64, 1.0)[:, 30].sum() <= 64, "a thin cord"
 
 
@@ -67,24 +66,19 @@ def test_furniture_that_stands_does_not_tip_over(foot):
     """Masks show one leg of a table alone, or one side of a desk; an object that hangs may have
     one."""
     shown = boxes((0, 64, 56, 64, 0, 64), foot)
-    hull = filled_cells(shown, CELLS, MARGIN)
-    legs = []
-    for hangs in (False, True):
-        found = fit_parts(rays_of(shown, 4000), hull, MARGIN, hangs)
-        levels = np.rint((found.ends + 0.5) * 64).astype(np.int64)
-        legs.append(overhang(found.mirrored, levels, area_table(found.outline, 64)))
-    assert legs[0] == 0 < legs[1]
+    stands, hangs = (stability_of(fitted(shown, hangs), False)[2] for hangs in (False, True))
+    assert stands == 0 < hangs
 
 
 def test_objects_without_rays_are_their_box():
     nothing = RayPool(np.zeros((5, 3)), np.zeros((5, 3)), np.zeros(5, bool))
-    found = fit_parts(nothing, np.zeros((CELLS,) * 3, bool), MARGIN)
+    found = fit_parts(nothing, np.zeros((CELLS,) * 3, bool), MARGIN, False)
     np.testing.assert_array_equal(found.ends, [[[-0.5, 0.5]] * 3])
 
 
 def test_the_loss_is_the_formula_of_the_docstring():
     rays = rays_of(TABLE, 500)
-    fit = RayFit(rays, MARGIN)
+    fit = RayFit(rays, MARGIN, SQUARE, False)
     ends = np.rint((TABLE.ends + 0.5) * 64).astype(np.int64)
     guess = fit.guess(TABLE.kind, TABLE.mirrored, ends)
     volume = 1 * 8 / 64 + 4 * (8 / 64) * (56 / 64) * (8 / 64)

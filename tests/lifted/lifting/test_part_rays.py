@@ -6,17 +6,20 @@ import shapely
 from parts_of_rooms import TABLE, rays_of
 
 from sceneprior.core.parts import ACROSS_X, ACROSS_Z, BOX, SQUARE, Parts, inside
-from sceneprior.lifted.lifting.part_loss import RayFit
-from sceneprior.lifted.lifting.part_rays import count_wrong, descend, meets
-from sceneprior.lifted.lifting.part_regularizers import (
-    LEVELS,
+from sceneprior.lifted.lifting.part_loss import (
+    RayFit,
     area_table,
-    cut_rays,
-    gap_and_pieces,
     outline_of,
-    overhang,
-    planes_of,
     points_within,
+    stability,
+)
+from sceneprior.lifted.lifting.part_rays import (
+    LEVELS,
+    count_wrong,
+    cut_rays,
+    descend,
+    meets,
+    planes_of,
     volume_of,
 )
 
@@ -44,77 +47,65 @@ def test_a_ray_meets_a_part_where_points_along_it_are_inside(kind, mirrored):
 
 @pytest.mark.parametrize("mirrored", range(4))
 def test_a_face_goes_where_the_fewest_rays_are_wrong(mirrored):
-    """A face of a box is moved; the levels are compared with trying each one."""
-    fit = RayFit(rays_of(TABLE, 400, seed=mirrored), MARGIN)
+    """The first face that `descend` moves, compared with trying each of its levels."""
+    fit = RayFit(rays_of(TABLE, 400, seed=mirrored), MARGIN, SQUARE, False)
     prices = fit.hit_price, fit.miss_price, 0.003, 0.002
     rng = np.random.default_rng(mirrored)
-    for face in range(6):
-        low = rng.integers(0, 30, 3)
+    for _ in range(4):
+        low = rng.integers(1, 30, 3)
         start = np.stack([low, low + rng.integers(5, 30, 3)], axis=1)
-        others = np.array([[[0, 64], [56, 64], [0, 64]]])
-        ends = np.concatenate([others, start[None]])
-        guess = fit.guess(np.zeros(2, int), np.array([0, mirrored]), ends)
-        axis, side = divmod(face, 2)
-        # The other faces are held by trying one face at a time, in the order of descend.
+        ends = np.array([[[0, 64], [56, 64], [0, 64]], start])
         trials = {}
-        reach = range(start[axis, 0] + 1, LEVELS + 1) if side else range(start[axis, 1])
-        for place in reach:
+        for place in range(start[0, 1]):
             moved = ends.copy()
-            moved[1, axis, side] = place
+            moved[1, 0, 0] = place
             trial = fit.guess(np.zeros(2, int), np.array([0, mirrored]), moved)
             wrong = (trial.met_by > 0) != fit.hits
             cost = prices[0] * (wrong & fit.hits).sum() + prices[1] * (wrong & ~fit.hits).sum()
             cost += prices[2] * volume_of(BOX, mirrored, moved[1])
-            cost += prices[3] * (not planes_of(moved, 1)[axis, place])
+            cost += prices[3] * (not planes_of(moved, 1)[0, place])
             trials[place] = cost
-        if face == 0:  # the first face that descend moves
-            one_sweep = fit.guess(np.zeros(2, int), np.array([0, mirrored]), ends)
-            before = min(trials.values())
-            descend(
-                fit.starts, fit.spans, fit.inverse, fit.hits, one_sweep.kinds, one_sweep.mirrored,
-                one_sweep.ends, one_sweep.covered, one_sweep.met_by, np.array([1]), 1, *prices,
-            )  # fmt: skip
-            assert fit.loss(one_sweep) <= fit.loss(guess) + 1
-            assert trials[int(one_sweep.ends[1, 0, 0])] == pytest.approx(before)
+        swept = fit.guess(np.zeros(2, int), np.array([0, mirrored]), ends)
+        descend(
+            fit.starts, fit.spans, fit.inverse, fit.hits, swept.kinds, swept.mirrored,
+            swept.ends, swept.covered, swept.met_by, np.array([1]), 1, *prices,
+        )  # fmt: skip
+        assert trials[int(swept.ends[1, 0, 0])] == pytest.approx(min(trials.values()))
 
 
-def test_gaps_are_those_to_the_floor_or_the_ceiling():
-    legs = np.array([[[0, 8], [0, 40], [0, 8]]])
-    top = np.array([[[0, 64], [41, 60], [0, 64]]])
-    both = np.concatenate([legs, top])
-    assert gap_and_pieces(np.array([3, 0]), both, EVERYWHERE, False) == (0, 1), "within a level"
-    assert gap_and_pieces(np.array([3, 0]), both, EVERYWHERE, True) == (4, 1)
-    top[0, 1, 0] = 42
-    apart = np.concatenate([legs, top])
-    for hangs, gap in ((False, 42), (True, 4)):
-        found = gap_and_pieces(np.array([3, 0]), apart, EVERYWHERE, hangs)
-        assert found == (gap, 5), "the gap is that of the largest piece"
-    assert gap_and_pieces(np.zeros(1, int), top, EVERYWHERE, False) == (42, 1)
+TOP, LEG = [[0, 64], [41, 60], [0, 64]], [[0, 8], [0, 40], [0, 8]]
+HIGH = [[0, 64], [42, 60], [0, 64]]
+POST = [[28, 36], [0, 40], [28, 36]]
+BOTH = ACROSS_X | ACROSS_Z
+TRIANGLE = area_table(np.array([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5]]), LEVELS)
+"""Without the corner at high x and z."""
+OUTSIDE = [[56, 64], [0, 40], [56, 64]]
 
 
-def test_what_lies_outside_the_outline_supports_nothing():
-    """A triangle without the corner at high x and z, in which one of four legs stands."""
-    legs = np.array([[[0, 8], [0, 40], [0, 8]], [[0, 64], [40, 64], [0, 64]]])
-    area = area_table(np.array([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5]]), 64)
-    assert area[-1, -1] == pytest.approx(64 * 64 / 2, rel=0.02)
-    assert area[8, 8] == 64 and area[20, 4] == 80
-    assert gap_and_pieces(np.array([3, 0]), legs, area, False) == (0, 1)
-    far = legs[:1] + np.array([[56], [0], [56]])
-    assert gap_and_pieces(np.zeros(1, int), far, area, False) == (64, 0)
-    both = np.concatenate([far, legs[1:]])
-    assert gap_and_pieces(np.zeros(2, int), both, area, False) == (40, 1)
-    assert overhang(np.zeros(1, int), far, area) == 0
+@pytest.mark.parametrize(
+    ("parts", "mirrored", "area", "hangs", "found"),
+    [
+        ([LEG, TOP], [BOTH, 0], EVERYWHERE, False, (0, 1, 0)),  # within a level
+        ([LEG, TOP], [BOTH, 0], EVERYWHERE, True, (4, 1, 0)),
+        ([LEG, HIGH], [BOTH, 0], EVERYWHERE, False, (42, 5, 0)),  # of the largest piece
+        ([LEG, HIGH], [BOTH, 0], EVERYWHERE, True, (4, 5, 0)),
+        ([HIGH], [0], EVERYWHERE, False, (42, 1, 0)),
+        ([LEG, TOP], [0, 0], EVERYWHERE, False, (0, 1, 2 * (32 - 8))),  # on one leg
+        ([LEG, TOP], [ACROSS_Z, 0], EVERYWHERE, False, (0, 1, 32 - 8)),
+        ([POST, TOP], [0, 0], EVERYWHERE, False, (0, 1, 0)),  # a pedestal
+        ([LEG, TOP], [BOTH, 0], TRIANGLE, False, (0, 1, 0)),
+        # What lies outside the outline closes no gap.
+        ([OUTSIDE], [0], TRIANGLE, False, (64, 0, 0)),
+        ([OUTSIDE, TOP], [0, 0], TRIANGLE, False, (41, 1, 0)),
+    ],
+)
+def test_parts_that_float_fall_apart_or_tip_over(parts, mirrored, area, hangs, found):
+    assert stability(np.array(mirrored), np.array(parts), area, hangs) == found
 
 
-def test_a_table_on_one_leg_would_tip_over():
-    top = [[0, 64], [56, 64], [0, 64]]
-    leg = [[0, 8], [0, 56], [0, 8]]
-    ends = np.array([top, leg])
-    assert overhang(np.array([0, ACROSS_X | ACROSS_Z]), ends, EVERYWHERE) == 0
-    assert overhang(np.array([0, 0]), ends, EVERYWHERE) == 2 * (32 - 8)
-    assert overhang(np.array([0, ACROSS_Z]), ends, EVERYWHERE) == 32 - 8
-    ends[1, [0, 2]] = 28, 36  # a pedestal
-    assert overhang(np.array([0, 0]), ends, EVERYWHERE) == 0
+def test_an_area_table_counts_cells():
+    assert TRIANGLE[-1, -1] == pytest.approx(64 * 64 / 2, rel=0.02)
+    assert TRIANGLE[8, 8] == 64 and TRIANGLE[20, 4] == 80
 
 
 def test_wrong_rays_of_several_objects_are_counted_at_once():
@@ -148,21 +139,12 @@ L_SHAPE = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.0], [0.0, 0.0], [0.0, 0.5
 CELLS = 30
 
 
-def standing(seen) -> np.ndarray:
-    """A hull with this plan, between two heights."""
-    hull = np.zeros((CELLS,) * 3, bool)
-    hull[:, 4:9] = seen[:, None]
-    return hull
-
-
-def plan(shape: shapely.Polygon) -> np.ndarray:
+def test_an_outline_is_the_plan_of_the_hull():
     middles = (np.arange(CELLS) + 0.5) / CELLS - 0.5
     x, z = np.meshgrid(middles, middles, indexing="ij")
-    return shapely.contains_xy(shape, x, z)
-
-
-def test_an_outline_is_the_plan_of_the_hull():
-    found = outline_of(standing(plan(shapely.Polygon(L_SHAPE))))
+    hull = np.zeros((CELLS,) * 3, bool)
+    hull[:, 4:9] = shapely.contains_xy(shapely.Polygon(L_SHAPE), x, z)[:, None]
+    found = outline_of(hull)
     shape, wanted = shapely.Polygon(found), shapely.Polygon(L_SHAPE)
     assert shape.symmetric_difference(wanted).area < 0.005
     assert all(found[:, axis].tolist().count(side) == 2 for axis in (0, 1) for side in (-0.5, 0.5))

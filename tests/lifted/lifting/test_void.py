@@ -47,7 +47,7 @@ def lifted_bed(room):
     boxes = lift_boxes(room)
     hulls = lift_shapes(room, boxes, GRID)
     rays = RayPool(*(part[0] for part in draw_rays(room, boxes, 1024, GRID.margin)))
-    parts = fit_parts(rays, hulls[0], GRID.margin)
+    parts = fit_parts(rays, hulls[0], GRID.margin, hangs=False)
     volume_m3 = filled_cells(parts, 64, 1.0).mean() * boxes.sizes_m[0].prod()
     return boxes.centers_m[0], boxes.sizes_m[0], volume_m3
 
