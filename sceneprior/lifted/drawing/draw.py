@@ -16,8 +16,8 @@ from sceneprior.lifted.drawing.plans import RoomPlans, check_floor, plan_rooms
 from sceneprior.lifted.drawing.steps import NUMBERS, Particles, Rejections, place_next
 from sceneprior.lifted.requests.floors import RoomShape
 from sceneprior.lifted.requests.relations import furniture_in
-from sceneprior.lifted.requests.request import Conditions
 from sceneprior.lifted.requests.rules import PlacementRules
+from sceneprior.lifted.requests.wishes import Conditions
 from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.contents import END
 from sceneprior.lifted.sampler.frames import FRAME_M, gaps_m
@@ -87,7 +87,7 @@ def draw_rooms(
         InputError: no room can meet the conditions, or none was found; the message says why.
     """
     check_floor(sampler, conditions, may_lack)
-    hard = conditions.has_rules or bool(conditions.wishes.labels)
+    hard = conditions.has_rules or bool(conditions.wishes.bounds)
     effort, rejections = REQUESTED if hard else PLAIN, Rejections()
     slots, size = sampler.max_objects, max(1, BATCH // effort.particles)
     none = torch.zeros(count, slots, dtype=torch.int64)

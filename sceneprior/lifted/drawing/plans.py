@@ -16,7 +16,7 @@ from sceneprior.core.mixtures import draw_index
 from sceneprior.core.shell import rectangle
 from sceneprior.lifted.requests.floors import Floor, RoomShape
 from sceneprior.lifted.requests.openings import place_openings
-from sceneprior.lifted.requests.request import Conditions
+from sceneprior.lifted.requests.wishes import Conditions
 from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.contents import END
 from sceneprior.lifted.sampler.frames import rectangle_sides, rectangles_of

@@ -19,7 +19,8 @@ from sceneprior.lifted.lifting import HANGS_M
 from sceneprior.lifted.prototype_decoder import PrototypeDecoder
 from sceneprior.lifted.prototypes import POSES
 from sceneprior.lifted.requests.relations import RelationChecks, furniture_in
-from sceneprior.lifted.requests.request import Conditions, RoomRequest
+from sceneprior.lifted.requests.request import RoomRequest
+from sceneprior.lifted.requests.wishes import Conditions
 from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.frames import side_of
 from sceneprior.paper.prior import TrainedPrior

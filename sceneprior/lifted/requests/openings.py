@@ -1,22 +1,20 @@
-"""Doors and windows of requests: their places, and the space in front that must stay free."""
+"""Doors and windows of requests, and their places in walls."""
 
-import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import shapely
-from jaxtyping import Float
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from sceneprior.core.checked import shown
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Opening
 from sceneprior.core.scene_json import check_openings
-from sceneprior.core.shell import Wall, space_before
-from sceneprior.lifted.requests.floors import Floor, RoomShape
+from sceneprior.core.shell import Wall
+from sceneprior.lifted.requests.floors import Floor
 
 DOOR_M = (0.9, 0.0, 2.0)
 """Default width, lower edge and upper edge of a door."""
@@ -24,14 +22,14 @@ WINDOW_M = (1.2, 0.9, 2.1)
 """Default width, lower edge and upper edge of a window."""
 MARGIN_M = 0.1
 """Distance of drawn doors and windows from the ends of their wall and from each other."""
-BEFORE_WINDOW_M = 0.4
-"""Depth of the floor in front of a window where objects must not be higher than the sill."""
 MOST_OPENINGS = 50
 PLACES = 50
 """Maximum number of places drawn for a door or a window."""
 COMPASS = {"north": (0.0, -1.0), "east": (1.0, 0.0), "south": (0.0, 1.0), "west": (-1.0, 0.0)}
 """Directions (x, z) out of the room by the names of walls. North is up in top-down pictures."""
-_TEXT = re.compile(r"\s*(door|window)s?(?:\s*@\s*(\w+)(?:\s*:\s*(\d+\.?\d*))?)?\s*")
+_TEXT = re.compile(
+    rf"\s*(door|window)s?(?:\s*@\s*({'|'.join(COMPASS)}|\d+)(?:\s*:\s*(\d+\.?\d*))?)?\s*"
+)
 
 
 _Pair = Annotated[tuple[float, float], Field(strict=False)]
@@ -100,30 +98,14 @@ def _read_opening(entry: Any) -> Opening | WantedOpening:
         top_m = top_m if found.top_m is None else found.top_m
         return Opening(found.kind, found.start_m, found.end_m, bottom_m, top_m)
     text = _TEXT.fullmatch(entry) if isinstance(entry, str) else None
-    if text is None or not (text[2] is None or text[2] in COMPASS or text[2].isdecimal()):
+    if text is None:
         raise InputError(
             f"An opening is {str(entry)[:40]!r}; expected door, window@north or door@south:1.5 (a "
             f"wall is {', '.join(COMPASS)} or a number; then metres along it)."
         )
-    wall = int(text[2]) if text[2] and text[2].isdecimal() else text[2]
+    wall = int(text[2]) if text[2] and text[2] not in COMPASS else text[2]
     at_m = None if text[3] is None else float(text[3])
-    kind: Literal["door", "window"] = "door" if text[1] == "door" else "window"
-    return WantedOpening(kind, wall, at_m)
-
-
-def moved(
-    openings: Sequence[Opening | WantedOpening], by_m: Float[np.ndarray, "2"]
-) -> tuple[Opening | WantedOpening, ...]:
-    """Move openings with their floor, by (x, z)."""
-    return tuple(
-        each._replace(
-            start_m=(each.start_m[0] + by_m[0], each.start_m[1] + by_m[1]),
-            end_m=(each.end_m[0] + by_m[0], each.end_m[1] + by_m[1]),
-        )
-        if isinstance(each, Opening)
-        else each
-        for each in openings
-    )
+    return WantedOpening("door" if text[1] == "door" else "window", wall, at_m)
 
 
 def place_openings(
@@ -150,28 +132,24 @@ def _placed(
     width_m, bottom_m, top_m = DOOR_M if wanted.kind == "door" else WINDOW_M
     choice = _choice(wanted, walls)
     room_m = np.array([max(wall.length_m - width_m - 2 * MARGIN_M, 0.0) for wall in choice])
-    taken = [shapely.LineString([each.start_m, each.end_m]) for each in there]
+    taken = shapely.MultiLineString([[each.start_m, each.end_m] for each in there])
     where = f"on {wanted.wall} " if wanted.wall is not None else ""
-    for _ in range(PLACES):
-        if wanted.at_m is not None:
-            wall, at_m = choice[0], wanted.at_m
-            if not width_m / 2 <= at_m <= wall.length_m - width_m / 2:
-                raise InputError(
-                    f"A {wanted.kind} {where}is {at_m:g} m along a wall of {wall.length_m:.2f} m; "
-                    f"it is {width_m:g} m wide and must lie in the wall."
-                )
-        elif room_m.sum() > 0:
+    for _ in range(PLACES if wanted.at_m is None else 1):
+        wall, at_m = choice[0], wanted.at_m
+        if at_m is None:
+            if not room_m.any():
+                break
             row = draws.choice(len(choice), p=room_m / room_m.sum())
-            wall = choice[row]
-            at_m = width_m / 2 + MARGIN_M + room_m[row] * draws.random()
-        else:
-            break
-        first, last = (wall.start_m + wall.direction * (at_m + s * width_m / 2) for s in (-1, 1))
-        line = shapely.LineString([first, last])
-        if all(line.distance(other) >= MARGIN_M for other in taken):
-            return Opening(wanted.kind, _pair(first), _pair(last), bottom_m, top_m)
-        if wanted.at_m is not None:
-            break
+            wall, at_m = choice[row], width_m / 2 + MARGIN_M + room_m[row] * draws.random()
+        elif not width_m / 2 <= at_m <= wall.length_m - width_m / 2:
+            raise InputError(
+                f"A {wanted.kind} {where}is {at_m:g} m along a wall of {wall.length_m:.2f} m; it "
+                f"is {width_m:g} m wide and must lie in the wall."
+            )
+        ends = [wall.start_m + wall.direction * (at_m + s * width_m / 2) for s in (-1, 1)]
+        if taken.is_empty or shapely.LineString(ends).distance(taken) >= MARGIN_M:
+            start_m, end_m = ((float(x), float(z)) for x, z in ends)
+            return Opening(wanted.kind, start_m, end_m, bottom_m, top_m)
     raise InputError(
         f"A {wanted.kind} {where}finds no free wall of {width_m + 2 * MARGIN_M:g} m; the floor is "
         "too small for its doors and windows, or they are in each other's way."
@@ -197,28 +175,3 @@ def _choice(wanted: WantedOpening, walls: list[Wall]) -> list[Wall]:
     longest = max(facing, key=lambda wall: wall.length_m)
     backwards = (longest.end_m - longest.start_m).sum() < 0
     return [Wall(longest.end_m, longest.start_m, longest.outward) if backwards else longest]
-
-
-def _pair(point: Float[np.ndarray, "2"]) -> tuple[float, float]:
-    return float(point[0]), float(point[1])
-
-
-class Zone(NamedTuple):
-    """Space in front of an opening that must stay free: a polygon (x, z) and a range of heights."""
-
-    polygon: shapely.Polygon
-    from_m: float
-    to_m: float
-
-
-def zones_of(shape: RoomShape) -> dict[str, list[Zone]]:
-    """The spaces that must stay free, by kind of opening: in front of a door, the volume through
-    which it swings, as deep as the door is wide; in front of a window, the space above the sill."""
-    zones: dict[str, list[Zone]] = {"door": [], "window": []}
-    for each in shape.openings:
-        is_door = each.kind == "door"
-        depth_m = math.dist(each.start_m, each.end_m) if is_door else BEFORE_WINDOW_M
-        # 1 cm smaller on all sides, so that furniture may touch the zone.
-        polygon = space_before(each, shape.inward(each), depth_m).buffer(-0.01)
-        zones[each.kind].append(Zone(polygon, 0.0 if is_door else each.bottom_m, each.top_m))
-    return zones

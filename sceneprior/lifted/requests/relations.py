@@ -23,14 +23,13 @@ its sill |
 """
 
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import shapely
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from sceneprior.core.scene import Opening
 from sceneprior.core.shell import Wall
 from sceneprior.lifted.requests.floors import Floor, RoomShape
 from sceneprior.lifted.requests.wishes import OPENINGS, RelationWish
@@ -67,7 +66,7 @@ class Furniture(NamedTuple):
     front: Float[np.ndarray, "objects 2"]
     """Unit vector (x, z) along which the front points; it need not be opposite to `back`."""
 
-    def rows(self, rows: Int[np.ndarray, " some"] | slice) -> "Furniture":
+    def rows(self, rows: np.ndarray | slice) -> "Furniture":
         """The objects of these rows."""
         return Furniture(*(part[rows] for part in self))
 
@@ -99,28 +98,23 @@ def furniture_in(sampler: RoomSampler, rooms: PosedRooms, row: int) -> Furniture
 def opening_items(shape: RoomShape, kind: str) -> Furniture:
     """The doors or windows of a room, as flat boxes whose front points into the room."""
     own = [each for each in shape.openings if each.kind == kind]
-    boxes = np.array([_opening_box(each) for each in own]).reshape(-1, 6)
+    boxes = np.zeros((len(own), 6))
+    for row, each in enumerate(own):
+        ends = np.array([each.start_m, each.end_m])
+        boxes[row, [0, 2]], boxes[row, [3, 5]] = ends.mean(axis=0), np.ptp(ends, axis=0)
+        boxes[row, 1], boxes[row, 4] = (each.top_m + each.bottom_m) / 2, each.top_m - each.bottom_m
     fronts = np.array([shape.inward(each) for each in own]).reshape(-1, 2)
     return Furniture(boxes, np.full(len(own), -1), np.zeros(len(own), dtype=np.int64), fronts)
 
 
-def _opening_box(opening: Opening) -> list[float]:
-    ends = np.array([opening.start_m, opening.end_m])
-    (x, z), (along_x, along_z) = ends.mean(axis=0), np.ptp(ends, axis=0)
-    height = opening.top_m - opening.bottom_m
-    return [x, (opening.top_m + opening.bottom_m) / 2, z, along_x, height, along_z]
-
-
 def related(
-    relation: str,
-    subjects: Furniture,
-    targets: Furniture,
-    to: Literal["window", "lamp"] | None = None,
+    relation: str, subjects: Furniture, targets: Furniture, label: str
 ) -> Bool[np.ndarray, "subjects targets"]:
     """True where a relation of `TO_TARGET` holds between a subject and a target.
 
     Args:
-        to: Given if the targets are windows or lamps, under which objects stand in other ways.
+        label: The targets' class, or `door` or `window`. Objects stand under windows and lamps in
+            other ways than under others.
     """
     here, there = subjects.boxes_m[:, None], targets.boxes_m[None]
     offset = (here - there)[..., [0, 2]]
@@ -143,12 +137,12 @@ def related(
     assert relation == "under", relation
     top = here[..., 1] + here[..., 4] / 2
     below = top <= there[..., 1] - there[..., 4] / 2 + 1e-3
-    if to == "window":
+    if label == "window":
         before = np.where(along, gaps, -np.inf).max(axis=-1) <= REACH_M
         return np.asarray(before & (across < 0) & below)
     within = (np.abs(offset) <= there[..., [3, 5]] / 2).all(axis=-1)
     within |= (np.abs(offset) <= here[..., [3, 5]] / 2).all(axis=-1)
-    return np.asarray(within & (below | (to == "lamp")))
+    return np.asarray(within & (below | ("lamp" in label)))
 
 
 def _in_sector(
@@ -200,6 +194,7 @@ class RelationChecks:
 
     def __init__(self, wishes: Sequence[RelationWish], shape: RoomShape, classes: Sequence[str]):
         self.wishes, self.shape, self.classes = wishes, shape, classes
+        self.index: dict[str | None, int] = {name: row for row, name in enumerate(classes)}
         self.openings = {kind: opening_items(shape, kind) for kind in OPENINGS}
 
     def held(self, furniture: Furniture) -> list[bool]:
@@ -227,20 +222,14 @@ class RelationChecks:
 
     def _met(self, wish: RelationWish, furniture: Furniture) -> Bool[np.ndarray, " subjects"]:
         """True for each object of the subject's class for which the relation holds."""
-        own = np.flatnonzero(furniture.object_class == self._index(wish.subject))
-        subjects = furniture.rows(own)
+        subjects, targets = (
+            furniture.rows(furniture.object_class == self.index.get(label, -2))
+            for label in (wish.subject, wish.target)
+        )
         if wish.target is None:
             return related_to_room(wish.relation, subjects, self.shape.floor)
-        if wish.target in OPENINGS:
-            to: Literal["window"] | None = "window" if wish.target == "window" else None
-            found = related(wish.relation, subjects, self.openings[wish.target], to)
-        else:
-            theirs = np.flatnonzero(furniture.object_class == self._index(wish.target))
-            lamps: Literal["lamp"] | None = "lamp" if "lamp" in wish.target else None
-            found = related(wish.relation, subjects, furniture.rows(theirs), lamps)
-            found &= own[:, None] != theirs[None]
+        targets = self.openings.get(wish.target, targets)
+        found = related(wish.relation, subjects, targets, wish.target)
+        if wish.subject == wish.target:
+            found &= ~np.eye(len(found), dtype=bool)
         return np.asarray(found.any(axis=1))
-
-    def _index(self, name: str) -> int:
-        """Index of a class; that of no object for other names."""
-        return self.classes.index(name) if name in self.classes else -2

@@ -1,21 +1,11 @@
 """Requests for rooms: floor, doors and windows, ceiling, wishes and given objects."""
 
-import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    PlainValidator,
-    ValidationError,
-    model_validator,
-)
+from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationError, model_validator
 
 from sceneprior.core.checked import shown
 from sceneprior.core.classes import label_set as label_set_of
@@ -23,15 +13,9 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Opening, SceneObject
 from sceneprior.core.scene_json import MOST_OBJECTS, ObjectEntry, check_box, read_object, unit_guess
 from sceneprior.lifted.requests.floors import Floor, read_floor
-from sceneprior.lifted.requests.openings import WantedOpening, moved, read_openings
+from sceneprior.lifted.requests.openings import WantedOpening, read_openings
 from sceneprior.lifted.requests.sentence import read_sentence
-from sceneprior.lifted.requests.wishes import (
-    OPENINGS,
-    Wishes,
-    check_wishes,
-    counts_of_text,
-    read_wishes,
-)
+from sceneprior.lifted.requests.wishes import OPENINGS, Conditions, Wishes, read_wishes
 
 HIGHEST_M = 20.0
 """Highest ceiling that can be requested."""
@@ -67,25 +51,9 @@ def _read_objects(objects: Any) -> tuple[SceneObject, ...]:
     return tuple(found)
 
 
-_Floor = Annotated[
-    Any, PlainValidator(_plain, json_schema_input_type=str | list[tuple[float, float]] | None)
-]
-_Openings = Annotated[
-    Any, PlainValidator(_plain, json_schema_input_type=str | list[dict[str, Any] | str] | None)
-]
-_Want = Annotated[
-    Any,
-    PlainValidator(
-        _plain,
-        json_schema_input_type=str
-        | dict[str, int | str | list[dict[str, str | int | None]]]
-        | None,
-    ),
-]
-_Objects = Annotated[
-    tuple[SceneObject, ...],
-    PlainValidator(_read_objects, json_schema_input_type=list[ObjectEntry]),
-]
+def _part(schema: Any) -> Any:
+    """A part that is kept as plain data, with the type that its JSON Schema shows."""
+    return Annotated[Any, PlainValidator(_plain, json_schema_input_type=schema)]
 
 
 class RoomRequest(BaseModel):
@@ -97,16 +65,19 @@ class RoomRequest(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
 
-    floor: _Floor = None
+    floor: _part(str | list[tuple[float, float]] | None) = None
     """`4x3` (metres along x and z), or corners [x, z] in order; see `read_floor`."""
-    openings: _Openings = None
+    openings: _part(str | list[dict[str, Any] | str] | None) = None
     """Doors and windows, such as `door,window@north`; see `read_openings`."""
     ceiling_m: Annotated[float, Field(strict=True)] | None = None
     """Height of the ceiling."""
-    want: _Want = None
-    """Wishes: a sentence (`read_sentence`), a mapping (`read_wishes`), or numbers of objects by
-    class as text (`counts_of_text`)."""
-    objects: _Objects = ()
+    want: _part(str | dict[str, int | str | list[dict[str, str | int | None]]] | None) = None
+    """Wishes: a sentence (`read_sentence`), or a mapping or text with numbers of objects by class
+    (`read_wishes`)."""
+    objects: Annotated[
+        tuple[SceneObject, ...],
+        PlainValidator(_read_objects, json_schema_input_type=list[ObjectEntry]),
+    ] = ()
     """Given objects, in the coordinates of the floor; they stay as they are."""
 
     @classmethod
@@ -168,11 +139,7 @@ class RoomRequest(BaseModel):
     @cached_property
     def wishes(self) -> Wishes | None:
         """The wishes; None if they are a sentence, which is read by what a prior knows."""
-        want = self.want
-        if isinstance(want, str):
-            want = counts_of_text(want)
-            return None if want is None else read_wishes(want)
-        return Wishes() if want is None else read_wishes(want)
+        return Wishes() if self.want is None else read_wishes(self.want)
 
     def parts(self) -> dict[str, Any]:
         """The parts that are set, as arguments of `Prior.sample`."""
@@ -206,7 +173,8 @@ class RoomRequest(BaseModel):
                         "one out."
                     )
                 outline_m = read_floor(sentence.floor)
-            openings += read_openings(sentence.openings)
+            if sentence.openings:
+                openings += read_openings(sentence.openings)
             wishes = sentence.wishes
         targets = {wish.target for wish in wishes.relations}
         for kind in OPENINGS:
@@ -214,7 +182,15 @@ class RoomRequest(BaseModel):
                 openings += read_openings(kind)
         if outline_m is not None and not (self.objects or stays):
             middle = (outline_m.min(axis=0) + outline_m.max(axis=0)) / 2
-            outline_m, openings = outline_m - middle, moved(openings, -middle)
+            outline_m = outline_m - middle
+            openings = tuple(
+                each._replace(
+                    start_m=tuple(each.start_m - middle), end_m=tuple(each.end_m - middle)
+                )
+                if isinstance(each, Opening)
+                else each
+                for each in openings
+            )
         classes = tuple(label_set_of(label_set))
         for item in self.objects:
             if item.label not in classes[1:]:
@@ -224,7 +200,7 @@ class RoomRequest(BaseModel):
                 )
         floor = None if outline_m is None else Floor(outline_m)
         found = Conditions(classes, floor, openings, self.ceiling_m, wishes, self.objects)
-        check_wishes(wishes, known, found.given, most)
+        found.check_wishes(known, most)
         return found
 
 
@@ -233,49 +209,3 @@ class RequestFile(RoomRequest):
 
     format: Literal["sceneprior-request"]
     version: Literal[1]
-
-
-@dataclass(frozen=True)
-class Conditions:
-    """Conditions that the rooms of a request must meet, as a prior understands them."""
-
-    classes: tuple[str, ...]
-    """Names of the prior's classes, `void` included."""
-    floor: Floor | None = None
-    """None draws a rectangle for each room."""
-    openings: tuple[Opening | WantedOpening, ...] = ()
-    ceiling_m: float | None = None
-    wishes: Wishes = field(default_factory=Wishes)
-    objects: tuple[SceneObject, ...] = ()
-    """Given objects, which stay as they are."""
-
-    @property
-    def given(self) -> Counter[str]:
-        """Number of given objects of each class."""
-        return Counter(item.label for item in self.objects)
-
-    @property
-    def required(self) -> list[int]:
-        """The class index of each object that the wishes require beyond the given ones."""
-        required = []
-        for label in self.wishes.labels:
-            missing = self.wishes.bounds(label)[0] - self.given[label]
-            required += [self.classes.index(label)] * max(0, missing)
-        return required
-
-    @property
-    def most(self) -> list[float]:
-        """Largest number of objects of each class."""
-        most = [math.inf] * len(self.classes)
-        for label in self.wishes.labels:
-            largest = self.wishes.bounds(label)[1]
-            if largest is not None:
-                most[self.classes.index(label)] = float(largest)
-        return most
-
-    @property
-    def has_rules(self) -> bool:
-        """True if there are conditions that the network does not know, so that places of objects
-        must be checked: openings, a ceiling, relations, or a floor that is not a rectangle."""
-        odd_floor = self.floor is not None and not self.floor.is_rectangle
-        return bool(self.openings or self.wishes.relations or self.ceiling_m or odd_floor)

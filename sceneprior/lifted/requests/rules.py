@@ -1,14 +1,16 @@
 """Placement rules of a requested room: walls behind backs, ceiling, doors and windows, relations,
 and paths from the doors. Candidate places of an object are checked against all of them."""
 
+import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import shapely
 from jaxtyping import Bool, Float, Int
 
+from sceneprior.core.shell import space_before
 from sceneprior.lifted.requests.floors import RoomShape
-from sceneprior.lifted.requests.openings import zones_of
 from sceneprior.lifted.requests.relations import OUTWARD, Furniture, RelationChecks, footprints
 from sceneprior.lifted.requests.wishes import RelationWish
 
@@ -29,8 +31,31 @@ ARM_M = 0.1
 """Largest gap between a path and an object that it reaches."""
 FLOOR_M = 0.3
 """Largest height of the bottom of objects that must be reached, which are those on the floor."""
+BEFORE_WINDOW_M = 0.4
+"""Depth of the floor in front of a window where objects must not be higher than the sill."""
 BEFORE_WINDOWS = ("lamp", "plant")
 """Words in the names of classes that may stand or hang in front of a window."""
+
+
+class Zone(NamedTuple):
+    """Space in front of an opening that must stay free: a polygon (x, z) and a range of heights."""
+
+    polygon: shapely.Polygon
+    from_m: float
+    to_m: float
+
+
+def zones_of(shape: RoomShape) -> dict[str, list[Zone]]:
+    """The spaces that must stay free, by kind of opening: in front of a door, the volume through
+    which it swings, as deep as the door is wide; in front of a window, the space above the sill."""
+    zones: dict[str, list[Zone]] = {"door": [], "window": []}
+    for each in shape.openings:
+        is_door = each.kind == "door"
+        depth_m = math.dist(each.start_m, each.end_m) if is_door else BEFORE_WINDOW_M
+        # 1 cm smaller on all sides, so that furniture may touch the zone.
+        polygon = space_before(each, shape.inward(each), depth_m).buffer(-0.01)
+        zones[each.kind].append(Zone(polygon, 0.0 if is_door else each.bottom_m, each.top_m))
+    return zones
 
 
 class PlacementRules:

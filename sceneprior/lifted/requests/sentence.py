@@ -7,57 +7,97 @@ the size of the floor or a room type. Unknown words are an error, so that no wis
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 from sceneprior.core.errors import InputError
-from sceneprior.lifted.requests.vocabulary import (
-    ARTICLES,
-    BEFORE_ROOMS,
-    BOUNDS,
-    FILLERS,
-    NOUNS,
-    NUMBERS,
-    PRONOUNS,
-    RELATION_WORDS,
-    ROOM_WORDS,
-    ROOMS,
-    WALLS,
-)
-from sceneprior.lifted.requests.wishes import CountWish, RelationWish, Wishes
+from sceneprior.lifted.requests.wishes import OPENINGS, CountWish, RelationWish, Wishes
 
+NOUNS: dict[str, tuple[str, ...]] = {
+    "bed": ("double_bed", "single_bed", "kids_bed", "bed"),
+    "double bed": ("double_bed", "bed"), "queen bed": ("double_bed",), "king bed": ("double_bed",),
+    "single bed": ("single_bed", "bed"), "twin bed": ("single_bed",),
+    "kids bed": ("kids_bed",), "children bed": ("kids_bed",), "bunk bed": ("kids_bed",),
+    "bedside table": ("nightstand", "night stand"), "night table": ("nightstand", "night stand"),
+    "nightstand": ("nightstand", "night stand"), "night stand": ("nightstand", "night stand"),
+    "closet": ("wardrobe",), "armoire": ("wardrobe",), "couch": ("sofa",), "settee": ("sofa",),
+    "sofa": ("sofa",), "lounge chair": ("armchair",), "easy chair": ("armchair",),
+    "dining chair": ("chair",), "office chair": ("chair",), "desk chair": ("chair",),
+    "dining table": ("table",), "side table": ("table",), "writing desk": ("desk",),
+    "vanity": ("dressing_table", "dresser"), "bookcase": ("bookshelf",), "cupboard": ("cabinet",),
+    "chest of drawers": ("cabinet", "dresser"), "dresser": ("dresser", "cabinet"),
+    "sideboard": ("cabinet",), "tv cabinet": ("tv_stand",), "tv bench": ("tv_stand",),
+    "tv unit": ("tv_stand",), "television stand": ("tv_stand",), "hanging lamp": ("pendant_lamp",),
+    "chandelier": ("pendant_lamp", "ceiling_lamp"), "ceiling light": ("ceiling_lamp",),
+    "lamp": ("ceiling_lamp", "pendant_lamp", "lamp"), "fridge": ("refridgerator",),
+    "refrigerator": ("refridgerator",), "tv": ("television",), "tub": ("bathtub",),
+}  # fmt: skip
+"""Classes that a noun may mean; the first class that the prior draws is used."""
+RELATION_WORDS = {
+    "beside": "beside", "next to": "beside", "at the side of": "beside", "alongside": "beside",
+    "in front of": "in front of", "before": "in front of", "facing": "facing",
+    "that faces": "facing", "which faces": "facing", "that face": "facing", "face": "facing",
+    "faces": "facing", "looking at": "facing", "at": "near", "under": "under",
+    "below": "under", "beneath": "under", "underneath": "under", "near": "near", "near to": "near",
+    "close to": "near", "by": "near", "far from": "far from", "far away from": "far from",
+    "away from": "far from",
+}  # fmt: skip
+"""Relations to an object, a door or a window."""
+ROOM_WORDS = {
+    f"{word} {article} {noun}": relation
+    for noun, relation, words in (
+        ("wall", "at a wall", ("at", "against", "along", "on", "by")),
+        ("corner", "in a corner", ("in", "at")),
+    )
+    for word in words
+    for article in ("a", "the", "one")
+}
+"""Relations to the room."""
+NUMBERS = {
+    "no": 0, "zero": 0, "without": 0, "a": 1, "an": 1, "one": 1, "another": 1, "two": 2, "three": 3,
+    "four": 4, "five": 5, "six": 6, "seven": 7, "eight": 8, "nine": 9, "ten": 10, "eleven": 11,
+    "twelve": 12,
+}  # fmt: skip
+BOUNDS = {"at least": ">=", "at most": "<=", "no more than": "<=", "no fewer than": ">=",
+          "up to": "<=", "exactly": ""}  # fmt: skip
+WALL_WORDS = {
+    f"{word} the {wall}{end}": wall
+    for word in ("in", "on", "to", "at")
+    for wall in ("north", "east", "south", "west")
+    for end in (" wall", "")
+}
+"""Walls of doors and windows."""
+ROOMS = {
+    "bedroom": ("bedroom", "all"), "living room": ("living", "all"),
+    "dining room": ("dining", "all"), "library": ("library", "all"),
+    "kitchen": ("kitchen", "all"), "room": (),
+}  # fmt: skip
+"""Room types, each with the endings of the label sets that contain it; `room` matches any."""
+FILLERS = (
+    "and", "with", ",", ";", ".", ":", "but", "also", "then", "please", "i", "we", "want", "would",
+    "like", "need", "give", "me", "us", "make", "draw", "is", "are", "be", "stands", "stand",
+    "standing", "placed", "put", "that", "which", "there", "has", "have", "having", "containing",
+    "should",
+)  # fmt: skip
+"""Words that are skipped."""
 LONGEST = 2000
 """Maximum number of characters of a sentence."""
 _UNIT = r"\s*(?:m|metres?|meters?)?"
-_SIZE = re.compile(
-    rf"(\d+\.?\d*){_UNIT}\s*(?:x|×|by)\s*(\d+\.?\d*)\s*(?:m|metres?|meters?)?\b(?!\s*[cm]m\b)"
-)
+_SIZE = re.compile(rf"(\d+\.?\d*){_UNIT}\s*(?:x|×|by)\s*(\d+\.?\d*){_UNIT}\b(?!\s*[cm]m\b)")
 _LENGTH = re.compile(r"\d+\.?\d*\s*(?:mm|cm|m|metres?|meters?|centimetres?|centimeters?)\b")
 _SIZE_TOKEN = "#"
 """Token for the size of the floor, so that it is not mistaken for the size of furniture."""
 _TOKEN = re.compile(r"[a-z_']+|\d+(?:\.\d+)?|\S")
 
 
-@dataclass
-class Sentence:
+class Sentence(NamedTuple):
     """The content of a sentence: wishes, floor and openings."""
 
     wishes: Wishes
-    floor: str | None = None
+    floor: str | None
     """Size such as `4x3`."""
-    openings: list[str] = field(default_factory=list)
+    openings: list[str]
     """Doors and windows in the form that `read_openings` reads."""
-
-
-@dataclass
-class _Group:
-    """The objects of one phrase."""
-
-    noun: str
-    number: int
-    bound: str
-    """`>=`, `<=`, or empty for exactly."""
-    new: bool
-    """False for "the bed", which refers to an object mentioned elsewhere."""
 
 
 def read_sentence(text: str, known: Sequence[str], label_set: str) -> Sentence:
@@ -81,12 +121,10 @@ def read_sentence(text: str, known: Sequence[str], label_set: str) -> Sentence:
     rest = _SIZE.sub(f" {_SIZE_TOKEN} ", lowered.replace(_SIZE_TOKEN, "?"))
     if (length := _LENGTH.search(rest)) is not None:
         raise _other_length(length[0])
-    tokens = _TOKEN.findall(rest)
-    reader = _Reader(tokens, known, label_set)
-    reader.read()
+    reader = _Reader(_lex(_TOKEN.findall(rest), _meanings(known)), label_set)
     if reader.strange:
         # If another word is unknown, words before a noun are left out: usually it is their noun.
-        fine = {*ARTICLES, *RELATION_WORDS, *NUMBERS, *" ".join(BOUNDS).split()}
+        fine = {"a", "an", "the", *RELATION_WORDS, *NUMBERS, *" ".join(BOUNDS).split()}
         listed = [
             word for word in reader.strange if not (word in fine or word.isdecimal())
         ] or reader.strange
@@ -108,110 +146,147 @@ def _other_length(length: str) -> InputError:
     )
 
 
-class _Reader:
-    """Reads tokens from left to right; `strange` collects unknown tokens."""
+class _Token(NamedTuple):
+    """A phrase of the vocabulary, or an unknown word."""
 
-    def __init__(self, tokens: list[str], known: Sequence[str], label_set: str):
-        self.tokens, self.at = tokens, 0
-        self.known, self.label_set = known, label_set
+    text: str
+    kind: str = "unknown"
+    value: Any = None
+
+
+def _meanings(known: Sequence[str]) -> dict[str, tuple[str, Any]]:
+    """The kind and the value of each phrase; later entries override earlier ones."""
+    nouns = {name.replace("_", " "): (name,) for name in known}
+    nouns |= {noun: classes for noun, classes in NOUNS.items() if noun not in known}
+    nouns |= {opening: (opening,) for opening in OPENINGS}
+    labels = {
+        noun: next((name for name in classes if name in known), classes[0])
+        for noun, classes in nouns.items()
+    }
+    plurals = {
+        plural: label
+        for noun, label in labels.items()
+        for plural in (f"{noun}s", f"{noun[:-1]}ves" if noun.endswith("f") else f"{noun}es")
+    }
+    return (
+        {word: ("filler", None) for word in (*FILLERS, _SIZE_TOKEN)}
+        | {word: ("before a room", None) for word in ("in", "for", "of")}
+        | {word: ("pronoun", None) for word in ("it", "them")}
+        | {"the": ("the", None), "some": ("some", None), "any": ("some", None)}
+        | {noun: ("noun", (False, label)) for noun, label in labels.items()}
+        | {noun: ("noun", (True, label)) for noun, label in plurals.items()}
+        | {room: ("room", ends) for room, ends in ROOMS.items()}
+        | {word: ("number", number) for word, number in NUMBERS.items()}
+        | {word: ("bound", sign) for word, sign in BOUNDS.items()}
+        | {word: ("relation", relation) for word, relation in RELATION_WORDS.items()}
+        | {word: ("relation to the room", relation) for word, relation in ROOM_WORDS.items()}
+        | {word: ("wall", wall) for word, wall in WALL_WORDS.items()}
+    )
+
+
+def _lex(words: list[str], meanings: dict[str, tuple[str, Any]]) -> list[_Token]:
+    """Split words into the longest phrases of the vocabulary, from left to right."""
+    longest = max(len(phrase.split()) for phrase in meanings)
+    tokens: list[_Token] = []
+    while words:
+        for length in range(min(longest, len(words)), 0, -1):
+            if (phrase := " ".join(words[:length])) in meanings:
+                break
+        if phrase.isdecimal():
+            tokens.append(_Token(phrase, "number", int(phrase)))
+        else:
+            tokens.append(_Token(phrase, *meanings.get(phrase, ())))
+        words = words[length:]
+    return tokens
+
+
+@dataclass
+class _Group:
+    """The objects of one phrase."""
+
+    noun: str
+    number: int
+    sign: str
+    """`>=`, `<=`, or empty for exactly."""
+    new: bool
+    """False for "the bed", which refers to an object mentioned elsewhere."""
+
+
+class _Reader:
+    """Reads tokens from left to right; `strange` collects words without a meaning where they
+    stand."""
+
+    def __init__(self, tokens: list[_Token], label_set: str):
+        self.tokens, self.label_set = [*tokens, _Token("", "end")], label_set
         self.strange: list[str] = []
         self.openings: list[str] = []
         self.groups: list[_Group] = []
         self.relations: list[RelationWish] = []
-        self.nouns = {name.replace("_", " "): (name,) for name in known} | {
-            noun: classes for noun, classes in NOUNS.items() if noun not in known
-        }
         self.subject: _Group | None = None
-
-    def read(self) -> None:
-        """Read all tokens."""
-        while self.at < len(self.tokens):
+        self.at = 0
+        while self.tokens[self.at].kind != "end":
             start = self.at
             if self._relation() or self._group() is not None or self.at > start:
                 continue
-            word = self.tokens[self.at]
+            token = self.tokens[self.at]
             self.at += 1
-            if word in BEFORE_ROOMS and self._in_room():
-                continue
-            if word not in (*FILLERS, _SIZE_TOKEN):
-                self.strange.append(word)
-
-    def _in_room(self) -> bool:
-        """Read a room type after "in", as in "two chairs in the room"."""
-        start = self.at
-        self._phrase(("a", "an", "the", "one", "my"))
-        found = self._room(None, None)
-        self.at = self.at if found else start
-        return found
+            if token.kind != "filler" and not (token.kind == "before a room" and self._in_room()):
+                self.strange += token.text.split()
 
     def wishes(self) -> Wishes:
         """The counts of all groups of the sentence, summed by class, and the relations between
         them."""
-        counts: list[CountWish] = []
+        groups = [group for group in self.groups if group.noun not in OPENINGS]
+        counts = [
+            CountWish(group.noun, 0, group.number)
+            if group.sign == "<="
+            else CountWish(group.noun, group.number)
+            for group in groups
+            if group.sign
+        ]
         exact: Counter[str] = Counter()
-        for group in self.groups:
-            if group.noun in ("door", "window"):
-                continue
-            if group.bound == "<=":
-                counts.append(CountWish(group.noun, 0, group.number))
-            elif group.bound == ">=":
-                counts.append(CountWish(group.noun, group.number))
-            else:
-                exact[group.noun] += group.number if group.new else 0
-        named = [g.noun for g in self.groups if g.new and not g.bound]
-        for noun in dict.fromkeys(named):
-            if noun not in ("door", "window"):
-                counts.append(CountWish(noun, exact[noun], exact[noun]))
-        present = {wish.label for wish in counts}
-        for group in self.groups:
-            if not group.new and group.noun not in present | {"door", "window"}:
-                counts.append(CountWish(group.noun, 1))
-                present.add(group.noun)
-        return Wishes(tuple(counts), tuple(self.relations))
+        for group in groups:
+            if group.new and not group.sign:
+                exact[group.noun] += group.number
+        counts += [CountWish(noun, number, number) for noun, number in exact.items()]
+        named = {wish.label for wish in counts}
+        others = dict.fromkeys(group.noun for group in groups if group.noun not in named)
+        return Wishes((*counts, *(CountWish(noun, 1) for noun in others)), tuple(self.relations))
 
-    def _phrase(self, words: Sequence[str]) -> str | None:
-        """Read the longest of some phrases that matches the next tokens; None if none does."""
-        for phrase in sorted(words, key=lambda each: -len(each.split())):
-            parts = phrase.split()
-            if self.tokens[self.at : self.at + len(parts)] == parts:
-                self.at += len(parts)
-                return phrase
-        return None
+    def _next(self, *kinds: str) -> _Token | None:
+        """Read the next token if it is of one of these kinds."""
+        token = self.tokens[self.at]
+        if token.kind not in kinds:
+            return None
+        self.at += 1
+        return token
+
+    def _in_room(self) -> bool:
+        """Read a room type after "in", as in "two chairs in the room"."""
+        start = self.at
+        self.at += self.tokens[start].text in ("a", "an", "the", "one", "my")
+        found = self._room(None, None)
+        self.at = self.at if found else start
+        return found
 
     def _relation(self) -> bool:
         """Read a relation of the last group, if one comes next."""
-        start = self.at
-        if (found := self._phrase(list(ROOM_WORDS))) is not None:
-            if self.subject is None:
-                self.strange.append(found)
-            else:
-                self._relate(ROOM_WORDS[found], None)
-            return True
-        if (
-            self._phrase(list(BOUNDS)) is not None
-        ):  # "at least" does not begin with the relation "at"
-            self.at = start
+        subject, token = self.subject, self._next("relation", "relation to the room")
+        if token is None:
             return False
-        if (found := self._phrase(list(RELATION_WORDS))) is None:
-            return False
-        subject = self.subject
-        target = self._target()
-        if subject is None or target is None or subject.noun in ("door", "window"):
-            self.strange.append(found)
-            self.at = max(self.at, start + len(found.split()))
+        to_room = token.kind == "relation to the room"
+        target = None if to_room else self._target()
+        if subject is None or (not to_room and (target is None or subject.noun in OPENINGS)):
+            self.strange.append(token.text)
             return True
         self.subject = subject
-        self._relate(RELATION_WORDS[found], target)
+        count = 1 if subject.sign == "<=" else max(subject.number, 1)
+        self.relations.append(RelationWish(subject.noun, token.value, target, count))
         return True
-
-    def _relate(self, relation: str, target: str | None) -> None:
-        assert self.subject is not None
-        count = 1 if self.subject.bound == "<=" else max(self.subject.number, 1)
-        self.relations.append(RelationWish(self.subject.noun, relation, target, count))
 
     def _target(self) -> str | None:
         """Read the target of a relation: a class, `door` or `window`."""
-        if self._phrase(PRONOUNS) is not None:
+        if self._next("pronoun") is not None:
             others = [g.noun for g in self.groups if self.subject and g.noun != self.subject.noun]
             return others[-1] if others else None
         group = self._group()
@@ -220,75 +295,46 @@ class _Reader:
     def _group(self) -> _Group | None:
         """Read a number and a noun, or a room, if they come next."""
         start = self.at
-        bound = self._phrase(list(BOUNDS))
-        definite = self._phrase(("the",)) is not None
-        number: int | None = None
-        if self.at < len(self.tokens) and self.tokens[self.at].isdecimal():
-            number = int(self.tokens[self.at])
-            self.at += 1
-        elif (word := self._phrase(list(NUMBERS))) is not None:
-            number = NUMBERS[word]
-            if word == "without":
-                self._phrase(("a", "an", "any"))
-        some = number is None and self._phrase(("some", "any")) is not None
-        sized = self._phrase((_SIZE_TOKEN,)) is not None
+        bound = self._next("bound")
+        definite = self._next("the") is not None
+        counted = self._next("number")
+        number = None if counted is None else int(counted.value)
+        if counted is not None and counted.text == "without":
+            self.at += self.tokens[self.at].text in ("a", "an", "any")
+        some = number is None and self._next("some") is not None
+        sized = self.tokens[self.at].text == _SIZE_TOKEN
+        self.at += sized
         if self._room(number, bound):
             return None
-        plural, noun = self._noun()
-        if noun is None:
+        if (token := self._next("noun")) is None:
             self.at = start
             return None
+        plural, noun = token.value
         if sized:
             raise _other_length(f"of the {noun.replace('_', ' ')}")
-        sign = BOUNDS[bound] if bound else ""
+        sign = bound.value if bound else ""
         if number is None:
             number = 2 if plural and not definite and not some else 1
             sign = ">=" if not definite else sign
         group = _Group(noun, number, sign, not definite)
-        if noun in ("door", "window"):
-            self._opening(group)
+        if noun in OPENINGS:
+            wall = self._next("wall")
+            if group.new and group.sign != "<=":
+                self.openings += [f"{noun}@{wall.value}" if wall else noun] * number
         self.groups.append(group)
         self.subject = group
         return group
 
-    def _room(self, number: int | None, bound: str | None) -> bool:
+    def _room(self, number: int | None, bound: _Token | None) -> bool:
         """Read a room type, and refuse a type that the prior does not draw."""
-        room = self._phrase(list(ROOMS))
-        if room is None:
+        if (room := self._next("room")) is None:
             return False
-        ends = ROOMS[room]
-        if ends and self.label_set.startswith("front3d_") and not self.label_set.endswith(ends):
+        is_other = room.value and not self.label_set.endswith(room.value)
+        if is_other and self.label_set.startswith("front3d_"):
             raise InputError(
-                f"The request is for a {room}, but this prior draws rooms of "
+                f"The request is for a {room.text}, but this prior draws rooms of "
                 f"'{self.label_set}'; take another prior, or leave the room type out."
             )
         if number not in (None, 1) or bound:
-            self.strange.append(room)
+            self.strange.append(room.text)
         return True
-
-    def _noun(self) -> tuple[bool, str | None]:
-        """Read a noun: whether it is a plural, and its class; (False, None) if there is none."""
-        names = {noun: (False, noun) for noun in (*self.nouns, "door", "window")}
-        names |= {plural: (True, noun) for noun in list(names) for plural in _plurals(noun)}
-        found = self._phrase(list(names))
-        if found is None:
-            return False, None
-        plural, noun = names[found]
-        if noun in ("door", "window"):
-            return plural, noun
-        classes = self.nouns[noun]
-        return plural, next((name for name in classes if name in self.known), classes[0])
-
-    def _opening(self, group: _Group) -> None:
-        """Add the doors or windows of a group, on the wall that is named next, if any."""
-        wall = ""
-        for direction in WALLS:
-            words = [f"{word} the {direction}" for word in ("in", "on", "to", "at")]
-            if self._phrase([f"{each} wall" for each in words] + words) is not None:
-                wall = f"@{direction}"
-        if group.new and group.bound != "<=":
-            self.openings += [f"{group.noun}{wall}"] * group.number
-
-
-def _plurals(noun: str) -> list[str]:
-    return [f"{noun}s", f"{noun[:-1]}ves"] if noun.endswith("f") else [f"{noun}s", f"{noun}es"]

@@ -1,13 +1,20 @@
-"""Wishes: constraints of a request on the numbers of objects in a room, and on their relations."""
+"""What a requested room must meet: wishes for numbers of objects and their relations, the floor,
+doors and windows, and given objects."""
 
+import math
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from sceneprior.core.checked import shown
 from sceneprior.core.classes import unknown_class
 from sceneprior.core.errors import InputError
+from sceneprior.core.scene import Opening, SceneObject
+from sceneprior.lifted.requests.floors import Floor
+from sceneprior.lifted.requests.openings import WantedOpening
 
 TO_ROOM = ("at a wall", "in a corner")
 """Relations to the room, which have no target."""
@@ -17,7 +24,7 @@ RELATIONS = (*TO_TARGET, *TO_ROOM)
 OPENINGS = ("door", "window")
 """Targets that are not furniture."""
 _COUNT = re.compile(r"\s*(>=|<=|=|)\s*(\d+)\s*")
-_ENTRY = re.compile(r"(\w+)\s*:\s*(\S.*)")
+_ENTRY = re.compile(r"\s*(\w+)\s*:\s*(\S.*?)\s*")
 
 
 @dataclass(frozen=True)
@@ -64,32 +71,124 @@ class Wishes:
     counts: tuple[CountWish, ...] = ()
     relations: tuple[RelationWish, ...] = ()
 
-    def bounds(self, label: str) -> tuple[int, int | None]:
-        """Smallest and largest number of objects of a class that meet all wishes; subjects and
+    @cached_property
+    def bounds(self) -> dict[str, tuple[int, int | float]]:
+        """Smallest and largest number of objects, by class, that meet all wishes; subjects and
         targets of relations are required, too."""
-        own = [wish for wish in self.counts if wish.label == label]
-        least = max([0, *(wish.least for wish in own), *self._needed(label)])
-        most = min((wish.most for wish in own if wish.most is not None), default=None)
-        return least, most
-
-    def _needed(self, label: str) -> list[int]:
-        """Number of objects of a class that each relation needs."""
-        needed = []
+        needs = [
+            (wish.label, wish.least, math.inf if wish.most is None else wish.most)
+            for wish in self.counts
+        ]
         for wish in self.relations:
             alike = wish.subject == wish.target
-            if wish.subject == label:
-                needed.append(max(wish.count, 2 if alike else 1))
-            elif wish.target == label:
-                needed.append(1)
-        return needed
+            needs.append((wish.subject, max(wish.count, 2 if alike else 1), math.inf))
+            if wish.target is not None:
+                needs.append((wish.target, 1, math.inf))
+        bounds: dict[str, tuple[int, int | float]] = {}
+        for label, least, most in needs:
+            if label not in OPENINGS:
+                low, high = bounds.get(label, (0, math.inf))
+                bounds[label] = max(low, least), min(high, most)
+        return bounds
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Conditions that the rooms of a request must meet, as a prior understands them."""
+
+    classes: tuple[str, ...]
+    """Names of the prior's classes, `void` included."""
+    floor: Floor | None = None
+    """None draws a rectangle for each room."""
+    openings: tuple[Opening | WantedOpening, ...] = ()
+    ceiling_m: float | None = None
+    wishes: Wishes = Wishes()
+    objects: tuple[SceneObject, ...] = ()
+    """Given objects, which stay as they are."""
 
     @property
-    def labels(self) -> list[str]:
-        """Classes that the wishes name, each once."""
-        named = [wish.label for wish in self.counts]
-        for wish in self.relations:
-            named += [wish.subject, *([wish.target] if wish.target else [])]
-        return [label for label in dict.fromkeys(named) if label not in OPENINGS]
+    def required(self) -> list[int]:
+        """The class index of each object that the wishes require beyond the given ones."""
+        given = Counter(item.label for item in self.objects)
+        return [
+            self.classes.index(label)
+            for label, (least, _) in self.wishes.bounds.items()
+            for _ in range(least - given[label])
+        ]
+
+    @property
+    def most(self) -> list[float]:
+        """Largest number of objects of each class."""
+        return [float(self.wishes.bounds.get(label, (0, math.inf))[1]) for label in self.classes]
+
+    @property
+    def has_rules(self) -> bool:
+        """True if there are conditions that the network does not know, so that places of objects
+        must be checked: openings, a ceiling, relations, or a floor that is not a rectangle."""
+        odd_floor = self.floor is not None and not self.floor.is_rectangle
+        return bool(self.openings or self.wishes.relations or self.ceiling_m or odd_floor)
+
+    def check_wishes(self, known: Sequence[str], most: int) -> None:
+        """Reject wishes that no room of a prior can meet.
+
+        Args:
+            known: Classes that the prior draws.
+            most: Maximum number of objects in a room.
+
+        Raises:
+            InputError: a class is unknown, or counts and relations contradict each other.
+        """
+        given, total = Counter(item.label for item in self.objects), 0
+        for label in dict.fromkeys([*self.wishes.bounds, *given]):
+            least, largest = self.wishes.bounds.get(label, (0, math.inf))
+            if label not in known and (least > given[label] or label not in given):
+                raise unknown_class(label, known)
+            if least > largest:
+                raise InputError(
+                    f"The wishes need {least} {label} and allow {largest}; change one of them."
+                )
+            if given[label] > largest:
+                raise InputError(
+                    f"The room is given with {given[label]} {label}, and the wishes allow "
+                    f"{largest}; change one of them."
+                )
+            total += max(least, given[label])
+        if total > most:
+            raise InputError(
+                f"The given and the requested objects are {total} together, but rooms of this run "
+                f"hold at most {most} (model.max_objects); ask for fewer."
+            )
+
+
+def read_wishes(want: Any) -> Wishes | None:
+    """Wishes from a mapping of classes to numbers, with relations under the key `relations`, or
+    from text such as `double_bed: 1, desk: 0`; None for other text, which is a sentence.
+
+    >>> [str(wish) for wish in read_wishes({"nightstand": 2, "desk": "<=1"}).counts]
+    ['2 nightstand', 'at most 1 desk']
+
+    Raises:
+        InputError: a wish has another form, or a class is listed twice.
+    """
+    if isinstance(want, str):
+        entries = [_ENTRY.fullmatch(part) for part in re.split("[,;]", want)]
+        if not all(entries):
+            return None
+        pairs = [entry.groups() for entry in entries if entry]
+        want = dict(pairs)
+        if len(want) < len(pairs):
+            ((label, _),) = Counter(label for label, _ in pairs).most_common(1)
+            raise InputError(f"The wishes list {label} twice; name each class once.")
+    relations = want.get("relations", []) if isinstance(want, Mapping) else None
+    if not isinstance(relations, Sequence) or not all(isinstance(e, Mapping) for e in relations):
+        raise InputError(
+            f"The wishes are {shown(want)}; expected a sentence, or numbers of objects by class "
+            "and a list `relations`."
+        )
+    return Wishes(
+        tuple(count_wish(key, value) for key, value in want.items() if key != "relations"),
+        tuple(relation_wish(entry) for entry in relations),
+    )
 
 
 def count_wish(label: str, value: Any) -> CountWish:
@@ -101,12 +200,8 @@ def count_wish(label: str, value: Any) -> CountWish:
     Raises:
         InputError: `value` has another form.
     """
-    found = None
-    if isinstance(value, str):
-        found = _COUNT.fullmatch(value)
-    elif isinstance(value, int) and not isinstance(value, bool) and value >= 0:
-        found = _COUNT.fullmatch(str(value))
-    if found is None:
+    is_number = isinstance(value, str | int) and not isinstance(value, bool)
+    if not is_number or (found := _COUNT.fullmatch(str(value))) is None:
         raise InputError(
             f"The wish for {label} is {str(value)[:40]!r}; expected a number of objects such as 2, "
             '">=1" or "<=3".'
@@ -115,26 +210,6 @@ def count_wish(label: str, value: Any) -> CountWish:
     if sign == ">=":
         return CountWish(label, number)
     return CountWish(label, 0 if sign == "<=" else number, number)
-
-
-def counts_of_text(text: str) -> dict[str, str] | None:
-    """Numbers of objects by class from text such as `double_bed: 1, desk: 0`; None for other text.
-
-    >>> counts_of_text("double_bed: 1, nightstand: >=2")
-    {'double_bed': '1', 'nightstand': '>=2'}
-
-    Raises:
-        InputError: a class is listed twice.
-    """
-    counts: dict[str, str] = {}
-    for part in re.split("[,;]", text):
-        if (entry := _ENTRY.fullmatch(part.strip())) is None:
-            return None
-        label, number = entry.groups()
-        if label in counts:
-            raise InputError(f"The wishes list {label} twice; name each class once.")
-        counts[label] = number
-    return counts
 
 
 def relation_wish(entry: Mapping[str, Any]) -> RelationWish:
@@ -159,59 +234,3 @@ def relation_wish(entry: Mapping[str, Any]) -> RelationWish:
     if not isinstance(count, int) or isinstance(count, bool) or count < 1:
         raise InputError(f"A relation has count {count!r}; expected a whole number above 0.")
     return RelationWish(str(subject), str(relation), None if target is None else str(target), count)
-
-
-def check_wishes(wishes: Wishes, known: Sequence[str], given: Mapping[str, int], most: int) -> None:
-    """Reject wishes that no room of a prior can meet.
-
-    Args:
-        known: Classes that the prior draws.
-        given: Objects that are already in the room, by class.
-        most: Maximum number of objects in a room.
-
-    Raises:
-        InputError: a class is unknown, or counts and relations contradict each other.
-    """
-    total = 0
-    for label in dict.fromkeys([*wishes.labels, *given]):
-        least, largest = wishes.bounds(label)
-        here = given.get(label, 0)
-        if label not in known and (least > here or label not in given):
-            raise unknown_class(label, known)
-        if largest is not None and least > largest:
-            raise InputError(
-                f"The wishes need {least} {label} and allow {largest}; change one of them."
-            )
-        if largest is not None and here > largest:
-            raise InputError(
-                f"The room is given with {here} {label}, and the wishes allow {largest}; change "
-                "one of them."
-            )
-        total += max(least, here)
-    if total > most:
-        raise InputError(
-            f"The given and the requested objects are {total} together, but rooms of this run "
-            f"hold at most {most} (model.max_objects); ask for fewer."
-        )
-
-
-def read_wishes(want: Any) -> Wishes:
-    """Wishes from a mapping of classes to numbers, with relations under the key `relations`.
-
-    >>> [str(wish) for wish in read_wishes({"nightstand": 2, "desk": "<=1"}).counts]
-    ['2 nightstand', 'at most 1 desk']
-
-    Raises:
-        InputError: a wish has another form.
-    """
-    relations = want.get("relations", []) if isinstance(want, Mapping) else None
-    if not isinstance(relations, Sequence) or not all(isinstance(e, Mapping) for e in relations):
-        raise InputError(
-            f"The wishes are {shown(want)}; expected a sentence, or numbers of objects by class "
-            "and a list `relations`."
-        )
-    numbers = {key: value for key, value in want.items() if key != "relations"}
-    return Wishes(
-        tuple(count_wish(key, value) for key, value in numbers.items()),
-        tuple(relation_wish(entry) for entry in relations),
-    )

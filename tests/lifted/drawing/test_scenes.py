@@ -15,7 +15,7 @@ from sceneprior.core.errors import InputWarning
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.lifted.drawing.draw import draw_rooms
 from sceneprior.lifted.lifting import HANGS_M
-from sceneprior.lifted.requests.request import Conditions
+from sceneprior.lifted.requests.wishes import Conditions
 from sceneprior.paper.sampling import draw_latents
 
 L_SHAPE = [[0, 0], [5, 0], [5, 3], [2.5, 3], [2.5, 6], [0, 6]]

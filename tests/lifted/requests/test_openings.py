@@ -6,13 +6,8 @@ import shapely
 
 from sceneprior.core.scene import Opening
 from sceneprior.lifted.requests.floors import Floor, RoomShape, read_floor
-from sceneprior.lifted.requests.openings import (
-    WantedOpening,
-    moved,
-    place_openings,
-    read_openings,
-    zones_of,
-)
+from sceneprior.lifted.requests.openings import WantedOpening, place_openings, read_openings
+from sceneprior.lifted.requests.rules import zones_of
 
 DOOR = Opening("door", (-0.5, -1.5), (0.4, -1.5), 0.0, 2.0)
 FLOOR = read_floor("4x3")
@@ -54,12 +49,6 @@ def test_drawn_places_lie_in_walls_apart_from_each_other():
         assert min(a.distance(b) for a in lines for b in lines if a is not b) >= 0.1 - 1e-9
         walls.add(tuple(np.round(lines[0].centroid.coords[0], 0)))
     assert len(walls) > 4
-
-
-def test_a_floor_that_moves_takes_its_openings_along():
-    door, drawn = moved([DOOR, WantedOpening("door")], np.array([1.0, 2.0]))
-    assert isinstance(door, Opening) and drawn == WantedOpening("door")
-    assert (door.start_m, door.end_m) == ((0.5, 0.5), (1.4, 0.5))
 
 
 def test_zones_reach_into_the_room():

@@ -45,7 +45,7 @@ def at(x: float, z: float, y: float = 0.25) -> list[float]:
     ],
 )
 def test_relations_to_a_bed_that_faces_high_z(relation, holds, fails):
-    found = related(relation, items(*holds, *fails), items(BED))[:, 0]
+    found = related(relation, items(*holds, *fails), items(BED), "bed")[:, 0]
     assert found.tolist() == [True] * len(holds) + [False] * len(fails)
 
 
@@ -62,15 +62,15 @@ def test_relations_turn_with_the_room(relation, quarters):
         turned = turned[:, [0, 1, 2, 5, 4, 3]]
     plain = furniture(boxes, back)
     other = furniture(turned, (back + quarters) % 4)
-    found = related(relation, plain, plain)
+    found = related(relation, plain, plain, "bed")
     assert found.any() and not found.all()
-    assert (related(relation, other, other) == found).all()
+    assert (related(relation, other, other, "bed") == found).all()
 
 
 def test_facing_is_the_front_of_the_object_itself():
     chair = at(0, 0)
-    assert related("facing", items(chair, back=2), items(BED))[0, 0]
-    assert not related("facing", items(chair, back=0), items(BED))[0, 0]
+    assert related("facing", items(chair, back=2), items(BED), "bed")[0, 0]
+    assert not related("facing", items(chair, back=0), items(BED), "bed")[0, 0]
 
 
 def test_under_a_lamp_and_under_a_window():

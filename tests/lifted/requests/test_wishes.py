@@ -1,18 +1,18 @@
 """Wishes and whole requests: what is read."""
 
+import math
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sceneprior.core.scene import SceneObject
+from sceneprior.core.scene import Opening, SceneObject
 from sceneprior.lifted.requests.openings import WantedOpening
 from sceneprior.lifted.requests.request import RoomRequest
 from sceneprior.lifted.requests.wishes import (
     RelationWish,
     Wishes,
-    check_wishes,
     count_wish,
-    counts_of_text,
     read_wishes,
 )
 
@@ -34,31 +34,36 @@ def test_numbers_are_exact_least_or_largest(value, bounds):
 
 def test_relations_need_their_objects():
     wishes = Wishes((), (RelationWish("nightstand", "beside", "bed", 2),))
-    assert wishes.bounds("nightstand") == (2, None) and wishes.bounds("bed") == (1, None)
-    assert Wishes((), (RelationWish("desk", "near", "desk"),)).bounds("desk") == (2, None)
-    assert Wishes((), (RelationWish("desk", "near", "window"),)).labels == ["desk"]
+    assert wishes.bounds["nightstand"] == (2, math.inf) and wishes.bounds["bed"] == (1, math.inf)
+    assert Wishes((), (RelationWish("desk", "near", "desk"),)).bounds["desk"] == (2, math.inf)
+    assert Wishes((), (RelationWish("desk", "near", "window"),)).bounds.keys() == {"desk"}
 
 
 def test_wishes_that_fit_pass():
-    check_wishes(read_wishes({"bed": 1, "desk": "<=2"}), KNOWN, {"bed": 1, "piano": 1}, 5)
+    given = [SceneObject(label, (0.0, 0.5, 0.0), (1.0, 1.0, 1.0)) for label in ("bed", "sofa")]
+    request = RoomRequest(want={"bed": 1, "desk": "<=2"}, objects=given)
+    assert request.conditions(KNOWN, LABELS, 5).required == []
 
 
 def test_a_floor_is_moved_to_its_middle_unless_objects_stand_on_it():
-    asked = {"floor": [[0, 0], [4, 0], [4, 2], [0, 2]]}
-    there = RoomRequest(**asked).conditions(KNOWN, LABELS, 9).floor
-    assert there is not None
-    assert there.outline_m.tolist() == [[-2, -1], [2, -1], [2, 1], [-2, 1]]
+    door = Opening("door", (1.0, 0.0), (2.0, 0.0), 0.0, 2.0)
+    asked = {"floor": [[0, 0], [4, 0], [4, 2], [0, 2]], "openings": [door, "window"]}
+    moved = RoomRequest(**asked).conditions(KNOWN, LABELS, 9)
+    assert moved.floor is not None
+    assert moved.floor.outline_m.tolist() == [[-2, -1], [2, -1], [2, 1], [-2, 1]]
+    there = door._replace(start_m=(-1.0, -1.0), end_m=(0.0, -1.0))
+    assert moved.openings == (there, WantedOpening("window"))
     sofa = SceneObject("sofa", (1.0, 0.4, 1.0), (1.0, 0.8, 1.0))
-    there = RoomRequest(**asked, objects=[sofa]).conditions(KNOWN, LABELS, 9).floor
-    assert there is not None and there.outline_m.tolist() == asked["floor"]
+    stays = RoomRequest(**asked, objects=[sofa]).conditions(KNOWN, LABELS, 9)
+    assert stays.floor is not None and stays.floor.outline_m.tolist() == asked["floor"]
+    assert stays.openings[0] == door
 
 
 def test_counts_as_text_are_those_of_a_mapping():
-    assert counts_of_text(" double_bed: 1; desk:0, stool : >=2") == {
-        "double_bed": "1", "desk": "0", "stool": ">=2",
-    }  # fmt: skip
+    found = read_wishes(" double_bed: 1; desk:0, stool : >=2")
+    assert found == read_wishes({"double_bed": 1, "desk": "0", "stool": ">=2"})
     for other in ("a bed", "two beds: 1", "bed: 1,", "bed 1", ""):
-        assert counts_of_text(other) is None
+        assert read_wishes(other) is None
 
 
 def test_a_relation_to_a_window_adds_the_window():
