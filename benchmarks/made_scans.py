@@ -32,7 +32,7 @@ from data_prep.front.models import ModelBank
 from data_prep.front.recipe import Recipe, load_recipe
 from data_prep.readers.annotations import LIKE_NYU40, NYU40, Labels, read_labels
 from data_prep.readers.frames import Y_UP
-from data_prep.readers.scanned_mesh import read_annotated_mesh
+from data_prep.readers.scan_files import read_annotated_mesh
 from sceneprior.core.classes import STUFF, label_set
 
 sys.path.append(str(Path(__file__).parents[1] / "tests" / "data_prep" / "scannet"))
@@ -160,9 +160,7 @@ def overlaps(scan: MadeScan, labels: Labels) -> dict[str, list[float]]:
         scan.alignment,
     )
     found = {
-        group.object_id: read.points_m(k)
-        for k, group in enumerate(read.groups)
-        if len(read.parts[k])
+        item.object_id: read.mesh.vertices_m[item.part] for item in read.objects if len(item.part)
     }
     scores: dict[str, list[float]] = defaultdict(list)
     for k, box in enumerate(scan.boxes):

@@ -93,6 +93,15 @@ def read_hdf5(path: Path, names: Sequence[str], hint: str) -> list[np.ndarray]:
         raise InputError(f"{path} cannot be read ({reason}): it is damaged; {hint}.") from None
 
 
+def unreadable(path: Path, error: Exception, why: str = "") -> InputError:
+    """Error of a scan's file that is missing or cannot be read."""
+    reason = getattr(error, "strerror", None) or error
+    return InputError(
+        f"{path} cannot be read ({reason}){'; ' if why else ''}{why}. "
+        f"Download it into the scan's folder, or leave {path.parent.name} out of the list of scans."
+    )
+
+
 @dataclass(frozen=True)
 class Labels:
     """Classes of the annotators' raw categories."""

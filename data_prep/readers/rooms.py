@@ -1,6 +1,6 @@
 """Turns frames of instance ids with cameras into a prepared room: its frame, views and truth."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -11,15 +11,22 @@ from data_prep.engine.source import Line, PreparedRoom, RoomTask
 from data_prep.readers.corrected import correct
 from data_prep.readers.frames import room_cameras
 from data_prep.readers.heading import find_turn, note_of_turn, turn_matrix
-from data_prep.readers.scanned_mesh import moved, surface_of, unoccluded
 from data_prep.readers.upright import find_floor
 from sceneprior.core.boxes import CUBE_CORNERS
+from sceneprior.core.cameras import to_camera, to_pixels
 from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.id_tables import IdTable, tidy
 from sceneprior.core.observations import Observations, RoomGroundTruth, observe, thinned_stuff
 from sceneprior.core.scene import Mesh
 from sceneprior.core.shell import rectangle
+from sceneprior.render.offscreen.zbuffer import NEAR_PLANE_M, rasterize
+
+_BEHIND_M = 0.05
+"""Minimum depth of a vertex behind the rendered surface to count as occluded; smaller depths occur
+at borders between objects."""
+_CUT_SHARE = 0.005
+"""Tolerance of the sides of the 2D box, relative to the image's longer side."""
 
 
 class ScannedObjects(NamedTuple):
@@ -83,6 +90,29 @@ class FramedRoom:
     why_below: str | None = "; poses and boxes do not belong together, or a file is damaged."
     """Likely reason why cameras are below the floor, as the end of a sentence; None allows it."""
 
+    def ends(self, objects: Sequence[int]) -> np.ndarray:
+        """Lower and upper corners of the boxes of these objects, (n, 2, 3)."""
+        boxes = [self.boxes[k] for k in objects]
+        return np.array([(points.min(axis=0), points.max(axis=0)) for points in boxes])
+
+    def moved(self, transform: np.ndarray) -> "FramedRoom":
+        """The room after a turn about y or a shift, (4, 4), that leaves heights above the floor as
+        they are; `floor_y`, `ceiling_y` and `top_y` stay those of before."""
+        level, shift = transform[:3:2, :3:2], transform[:3:2, 3]
+        scan = self.scan
+        if scan is not None:
+            vertices_m = to_camera(scan.mesh.vertices_m, transform)
+            scan = scan._replace(mesh=Mesh(vertices_m, scan.mesh.faces))
+        return replace(
+            self,
+            camera_to_world=transform @ self.camera_to_world,
+            world_from_file=transform @ self.world_from_file,
+            boxes={k: to_camera(points, transform) for k, points in self.boxes.items()},
+            scan=scan,
+            floor_m=None if self.floor_m is None else self.floor_m @ level.T + shift,
+            center_m=None if self.center_m is None else level @ self.center_m + shift,
+        )
+
 
 def numbered(
     numbers: np.ndarray,
@@ -140,62 +170,34 @@ def prepare_room(task: RoomTask, room: FramedRoom) -> PreparedRoom | Line:
         cameras = room_cameras(room.camera_to_world)
         degrees = find_turn(seen.room_views(room_id, cameras, room.intrinsics, room.stuff))
         notes += note_of_turn(degrees)
-        room = _turned(room, degrees) if degrees else room
-    boxes_of = {
-        k: np.stack([points.min(axis=0), points.max(axis=0)]) for k, points in room.boxes.items()
-    }
-    objects = [*seen.tracked.tolist(), *(k for k in seen.unseen.tolist() if k in boxes_of)]
-    around = [k for k in (objects if room.floor_of_unseen else seen.tracked) if k in boxes_of]
-    outline, origin = _floor(room, seen, np.array([boxes_of[k] for k in around]), notes)
-    room_from_world = np.eye(4)
-    room_from_world[:3, 3] = -origin
-    world_to_camera = room_cameras(room.camera_to_world, room_from_world)
-    views = seen.room_views(room_id, world_to_camera, room.intrinsics, room.stuff)
-    room_from_file = room_from_world @ room.world_from_file
+        room = room.moved(turn_matrix(degrees)) if degrees else room
+    objects = [*seen.tracked.tolist(), *(k for k in seen.unseen.tolist() if k in room.boxes)]
+    around = [k for k in (objects if room.floor_of_unseen else seen.tracked) if k in room.boxes]
+    outline, origin = _floor(room, seen, room.ends(around), notes)
+    ceiling_y = room.ceiling_y
+    if ceiling_y is None:
+        ceiling_y = max(room.camera_to_world[:, 1, 3].max(), room.top_y)
+    to_origin = np.eye(4)
+    to_origin[:3, 3] = -origin
+    room = replace(room, floor_m=outline).moved(to_origin)
+    cameras = room_cameras(room.camera_to_world)
+    views = seen.room_views(room_id, cameras, room.intrinsics, room.stuff)
     if degrees:
-        views = replace(views, turned_deg=degrees, room_from_world=room_from_file)
+        views = replace(views, turned_deg=degrees, room_from_world=room.world_from_file)
     truth: RoomGroundTruth | None = None
     models: dict[str, Mesh] = {}
-    missing = sum(k not in boxes_of for k in seen.tracked)
+    missing = sum(k not in room.boxes for k in seen.tracked)
     if not missing:
-        ceiling_y = room.ceiling_y
-        if ceiling_y is None:
-            ceiling_y = max(room.camera_to_world[:, 1, 3].max(), room.top_y)
-        truth = _truth(
-            room.object_class[objects],
-            np.array([boxes_of[k] for k in objects]) - origin,
-            outline - origin[::2],
-            float(ceiling_y - origin[1]),
-        )
+        truth, models = _truth(room, objects, float(ceiling_y - origin[1]))
         if room.scan is not None:
-            scan = room.scan._replace(mesh=moved(room.scan.mesh, room_from_world))
-            truth, models = _with_surfaces(truth, scan, objects)
-            whole = unoccluded(
-                scan.mesh, scan.parts, seen.tracked, world_to_camera, room.intrinsics,
-                views.image_size,
-            )  # fmt: skip
+            size = views.image_size
+            whole = unoccluded(room.scan, seen.tracked, cameras, room.intrinsics, size)
             truth = replace(truth, unoccluded=whole)
-    elif boxes_of:
+    elif room.boxes:
         notes.append(f"{missing} of {len(seen.tracked)} objects have no 3D box: no ground truth")
-    cameras_of = {"file": room.poses_file, "room_from_world": room_from_file.round(9).tolist()}
+    origin_of = {"file": room.poses_file, "room_from_world": room.world_from_file.round(9).tolist()}
     return PreparedRoom(
-        views, truth, models, notes=tuple(notes), cameras=cameras_of if room.poses_file else {}
-    )
-
-
-def _turned(room: FramedRoom, degrees: float) -> FramedRoom:
-    """Turn the world of a room about +y."""
-    turn = turn_matrix(degrees)
-    rotation, level = turn[:3, :3], turn[:3:2, :3:2]
-    scan = room.scan
-    return replace(
-        room,
-        camera_to_world=turn @ room.camera_to_world,
-        world_from_file=turn @ room.world_from_file,
-        boxes={k: points @ rotation.T for k, points in room.boxes.items()},
-        scan=None if scan is None else scan._replace(mesh=moved(scan.mesh, turn)),
-        floor_m=None if room.floor_m is None else room.floor_m @ level.T,
-        center_m=None if room.center_m is None else level @ room.center_m,
+        views, truth, models, notes=tuple(notes), cameras=origin_of if room.poses_file else {}
     )
 
 
@@ -207,17 +209,25 @@ def _floor(
     `boxes` are lower and upper corners, (n, 2, 3), of the objects that stand on it.
     """
     eyes = room.camera_to_world[:, :3, 3]
+    lowest = float(eyes[:, 1].min())
     floor_y = room.floor_y
     if floor_y is None and len(boxes):
         floor_y = float(boxes[:, 0, 1].min())
     elif floor_y is None and room.assumed_camera_m is None:
         raise InputError(f"{room.where}: no visible object has a 3D box, so the floor is unknown.")
     elif floor_y is None:
-        floor_y, note = _floor_in_views(room, seen, float(eyes[:, 1].min()))
-        notes.append(note)
-    if room.why_below is not None and eyes[:, 1].min() <= floor_y:
+        found = find_floor(seen, room_cameras(room.camera_to_world), room.intrinsics)
+        if found is not None and found[0] < lowest:
+            floor_y, pieces = found
+            under = f"{lowest - floor_y:.2f} m below the lowest camera"
+            notes.append(f"the floor is found where {pieces} pieces end, {under}")
+        else:
+            height, why = room.assumed_camera_m or 0.0, "too few pieces show where they end"
+            floor_y = lowest - height
+            notes.append(f"the floor is assumed {height:g} m below the lowest camera ({why})")
+    if room.why_below is not None and lowest <= floor_y:
         raise InputError(
-            f"{room.where}: its lowest camera is at {eyes[:, 1].min():.2f} m, below the floor at "
+            f"{room.where}: its lowest camera is at {lowest:.2f} m, below the floor at "
             f"{floor_y:.2f} m{room.why_below}"
         )
     outline = room.floor_m
@@ -230,53 +240,103 @@ def _floor(
     return outline, np.array([center[0], floor_y, center[1]])
 
 
-def _floor_in_views(room: FramedRoom, seen: Observations, lowest: float) -> tuple[float, str]:
-    """Height of a floor that no file states, found from the views or assumed; and a note on it."""
-    found = find_floor(seen, room_cameras(room.camera_to_world), room.intrinsics)
-    if found is not None and found[0] < lowest:
-        level, pieces = found
-        under = f"{lowest - level:.2f} m below the lowest camera"
-        return level, f"the floor is found where {pieces} pieces end, {under}"
-    height = room.assumed_camera_m or 0.0
-    why = "too few pieces show where they end"
-    return lowest - height, f"the floor is assumed {height:g} m below the lowest camera ({why})"
-
-
 def _truth(
-    object_class: np.ndarray, corners_m: np.ndarray, floor_m: np.ndarray, height_m: float
-) -> RoomGroundTruth:
-    """Ground truth of objects with lower and upper corners, (m, 2, 3), and without meshes."""
-    centers_m, sizes_m = corners_m.mean(axis=1), corners_m[:, 1] - corners_m[:, 0]
-    places = np.zeros((len(corners_m), 4, 4))
-    places[:, range(3), range(3)] = sizes_m  # from the unit cube, since there are no models
-    places[:, :3, 3], places[:, 3, 3] = centers_m, 1
-    return RoomGroundTruth(
-        object_class=object_class,
-        centers_m=centers_m.astype(np.float32),
-        sizes_m=sizes_m.astype(np.float32),
-        yaw_rad=np.zeros(len(corners_m), dtype=np.float32),
-        model_ids=("",) * len(corners_m),
-        model_to_room=places.astype(np.float32),
-        floor_m=floor_m.astype(np.float32),
-        height_m=height_m,
-    )
-
-
-def _with_surfaces(
-    truth: RoomGroundTruth, scan: ScannedObjects, objects: list[int]
+    room: FramedRoom, objects: list[int], height_m: float
 ) -> tuple[RoomGroundTruth, dict[str, Mesh]]:
-    """Give objects that have triangles a model: their surface, its box centred at the origin."""
-    models: dict[str, Mesh] = {}
-    places, model_ids = truth.model_to_room.copy(), [*truth.model_ids]
-    for row, k in enumerate(objects):
-        points = scan.mesh.vertices_m[scan.parts[k]]
+    """Ground truth of objects, and models: an object of which the scan has triangles has its
+    surface, centred in its box, and any other the unit cube, which is no model."""
+    ends = room.ends(objects)
+    centers_m, sizes_m = ends.mean(axis=1), ends[:, 1] - ends[:, 0]
+    places = np.zeros((len(objects), 4, 4))
+    places[:, range(3), range(3)] = sizes_m
+    places[:, :3, 3], places[:, 3, 3] = centers_m, 1
+    scan, models = room.scan, {}
+    model_ids = [""] * len(objects)
+    for row, k in enumerate([] if scan is None else objects):
+        assert scan is not None
         surface = surface_of(scan.mesh, scan.parts[k])
         if surface is not None:
+            points = scan.mesh.vertices_m[scan.parts[k]]
             center_m = (points.min(axis=0) + points.max(axis=0)) / 2
             model_ids[row] = scan.model_ids[k]
             models[model_ids[row]] = Mesh(surface.vertices_m - center_m, surface.faces)
             places[row, range(3), range(3)] = 1
-    return replace(truth, model_ids=tuple(model_ids), model_to_room=places), models
+    truth = RoomGroundTruth(
+        object_class=room.object_class[objects],
+        centers_m=centers_m.astype(np.float32),
+        sizes_m=sizes_m.astype(np.float32),
+        yaw_rad=np.zeros(len(objects), dtype=np.float32),
+        model_ids=tuple(model_ids),
+        model_to_room=places.astype(np.float32),
+        floor_m=room.floor_m.astype(np.float32),
+        height_m=height_m,
+    )
+    return truth, models
+
+
+def surface_of(mesh: Mesh, part: np.ndarray) -> Mesh | None:
+    """Cut the submesh with the vertices `part` out of a mesh; None if it has no triangles.
+
+    All vertices of the part are kept, even if no triangle uses them, as at borders with other
+    objects, so that the surface has the same bounding box as the object.
+    """
+    part = np.sort(part)
+    number = np.full(len(mesh.vertices_m), -1)
+    number[part] = np.arange(len(part))
+    faces = number[mesh.faces]
+    faces = faces[(faces >= 0).all(axis=1)]
+    return Mesh(mesh.vertices_m[part], faces) if len(faces) else None
+
+
+def unoccluded(
+    scan: ScannedObjects,
+    chosen: Iterable[int],
+    world_to_camera: np.ndarray,
+    intrinsics: np.ndarray,
+    image_size: tuple[int, int],
+) -> np.ndarray:
+    """Find the views that show each chosen object without occlusion, (views, len(chosen)) bool.
+
+    The 2D box of its visible vertices is compared with the 2D box of all its vertices. Everything
+    in the mesh occludes: walls, doors, objects, unannotated surfaces. Indices from the number of
+    objects on are never unoccluded. `intrinsics` is (3, 3).
+    """
+    mesh, parts = scan.mesh, scan.parts
+    height, width = image_size
+    projection = focal_and_center(intrinsics)
+    slack = _CUT_SHARE * max(height, width)
+    chosen = list(chosen)
+    whole = np.zeros((len(world_to_camera), len(chosen)), dtype=bool)
+    owner = np.full(len(mesh.vertices_m) + 1, -1)
+    for k, part in enumerate(parts):
+        owner[part] = k
+    # The last row is for pixels that show no surface.
+    owners = np.concatenate([owner[mesh.faces], [[-1, -1, -1]]])
+    for view, camera in enumerate(world_to_camera):
+        index, nearest = rasterize(mesh.vertices_m, mesh.faces, camera, projection, image_size)
+        for column, k in enumerate(chosen):
+            if k >= len(parts):
+                continue
+            points = to_camera(mesh.vertices_m[parts[k]], camera)
+            depth = points[:, 2]
+            if (depth <= NEAR_PLANE_M).any():
+                continue
+            pixels = to_pixels(points, intrinsics)
+            columns, rows = np.floor(np.clip(pixels, -1, max(height, width))).astype(np.int64).T
+            seen = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+            at = rows[seen], columns[seen]
+            hidden = (nearest[at] < depth[seen] - _BEHIND_M) & (owners[index[at]] != k).all(axis=1)
+            seen[seen] = ~hidden
+            if seen.any():
+                ends = [np.stack([ends.min(axis=0), ends.max(axis=0)])
+                        for ends in (pixels, pixels[seen])]  # fmt: skip
+                whole[view, column] = np.abs(ends[0] - ends[1]).max() <= slack
+    return whole
+
+
+def focal_and_center(K: np.ndarray) -> tuple[float, float, float, float]:
+    """Focal lengths and principal point of intrinsics, (3, 3), as `rasterize` takes them."""
+    return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
 
 
 def corners_of(center: np.ndarray, axes: np.ndarray, half: np.ndarray) -> np.ndarray:

@@ -1,41 +1,46 @@
-"""Reads the files of a scan of ScanNet: recording (`.sens`), alignment (`.txt`), masks (zip)."""
+"""Reads the files of a scan: ScanNet's recording (`.sens`), alignment (`.txt`) and masks (zip); and
+the annotated mesh that ScanNet and ScanNet++ have."""
 
+import contextlib
 import io
 import re
 import struct
 import zipfile
 import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Annotated, BinaryIO, NamedTuple, TypeVar
 
 import numpy as np
 from PIL import Image
+from pydantic import BaseModel, Field
 
-from data_prep.readers.frames import is_pose, pose_fault
-from data_prep.readers.scanned_mesh import unreadable
-from sceneprior.core.checked import plain, shown
+from data_prep.readers.annotations import unreadable
+from sceneprior.core.cameras import to_camera
+from sceneprior.core.checked import checked, plain, shown
 from sceneprior.core.errors import InputError
+from sceneprior.core.files import read_json
 from sceneprior.core.id_tables import png_kind
+from sceneprior.core.scene import Mesh
 
-MASK_FILES = {"filt": "_2d-instance-filt.zip", "raw": "_2d-instance.zip"}
-"""Suffix of the archive's name, after the scan's, for each value of `--masks`."""
 _LARGEST_MEMBER_BYTES = 64 << 20
 """Size limit of a mask; a mask of 1296 x 968 pixels has some 10 KB, or 1.2 MB uncompressed."""
-VERSION = 4
-_COMPRESSIONS = (-1, 0, 1, 2)
+_COMPRESSIONS = {-1, 0, 1, 2}
 _LONGEST_SIDE_PX = 1 << 16
 """Image size from which a file counts as damaged; the data set has no such images."""
-_ALIGNMENT = re.compile(r"\s*axisAlignment\s*=")
 _FRAME = struct.Struct("<16f4Q")
 """Header of a frame: camera_to_world; timestamps and byte counts of colour and depth."""
 _AFTER_CALIBRATION = struct.Struct("<2i4IfQ")
 """Rest of the header: compressions; widths and heights of colour and depth; depth shift; number of
 frames."""
+_DAMAGE = (OSError, ValueError, SyntaxError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error)
+"""Errors of damaged zips and PNGs; RuntimeError means a password, or a method that is unknown."""
+_M = TypeVar("_M", bound=BaseModel)
+_Index = Annotated[int, Field(strict=True, ge=0, lt=2**31)]
 
 
-@dataclass(frozen=True)
-class SensRecording:
+class SensRecording(NamedTuple):
     """Cameras of a `.sens` recording.
 
     Depth and colour of the release are already aligned, so the header's extrinsics are not used.
@@ -80,41 +85,36 @@ class _Part:
 
     def take(self, count: int, what: str) -> bytes:
         """Read the next bytes."""
-        self.check(count, what)
-        data = self.file.read(count)
-        self.at += count
-        return data
+        self.skip(count, what)
+        self.file.seek(self.at - count)
+        return self.file.read(count)
 
     def skip(self, count: int, what: str) -> None:
-        self.check(count, what)
-        self.at = self.file.seek(self.at + count)
-
-    def check(self, count: int, what: str) -> None:
-        """Check that the next bytes lie inside the file."""
+        """Go on behind the next bytes, which must lie inside the file."""
         if count > self.size - self.at:
             # A negative size, read as unsigned, is very large and also ends here.
             raise InputError(
                 f"{self.where()}: {what} should take {count} bytes, but {self.size - self.at} are "
                 "left; the file is truncated or damaged. Download it again."
             )
+        self.at += count
 
     def where(self) -> str:
         return f"{self.path}, {self.name}, byte {self.at}"
 
 
 def _read(part: _Part) -> SensRecording:
-    where = part.where()
     version = int.from_bytes(part.take(4, "the version"), "little")
-    if version != VERSION:
+    if version != 4:
         raise InputError(
-            f"{where}: version {version}, expected {VERSION}; "
+            f"{part.path}, header, byte 0: version {version}, expected 4; "
             "this is not a .sens file of ScanNet's release, or it is damaged."
         )
     part.skip(int.from_bytes(part.take(8, "the sensor's name"), "little"), "the sensor's name")
     where = part.where()
     intrinsics = np.eye(3)
-    matrices = part.take(4 * 64, "the calibration")
-    intrinsics[:2] = np.frombuffer(matrices, dtype="<f4", count=16).reshape(4, 4)[:2, :3]
+    matrices = np.frombuffer(part.take(4 * 64, "the calibration"), dtype="<f4")
+    intrinsics[:2] = matrices[:16].reshape(4, 4)[:2, :3]
     focal = intrinsics[(0, 1), (0, 1)]
     if not np.isfinite(intrinsics[:2]).all() or not (focal > 0).all():
         raise InputError(
@@ -126,7 +126,7 @@ def _read(part: _Part) -> SensRecording:
     where = part.where()
     rest = part.take(_AFTER_CALIBRATION.size, "the sizes")
     color_kind, depth_kind, width, height, *depth, _, frames = _AFTER_CALIBRATION.unpack(rest)
-    if color_kind not in _COMPRESSIONS or depth_kind not in _COMPRESSIONS:
+    if not {color_kind, depth_kind} <= _COMPRESSIONS:
         raise InputError(
             f"{where}: compressions {color_kind} (colour) and {depth_kind} (depth), expected 0, 1 "
             "or 2; the file is damaged. Download it again."
@@ -150,38 +150,22 @@ def _read(part: _Part) -> SensRecording:
     # number means a broken download.
     part.name = "IMU records"
     if part.at != part.size:
-        part.check(8, "their count")
+        part.skip(8, "their count")
     camera_to_world = np.frombuffer(poses, "<f4").reshape(-1, 4, 4).astype(np.float32)
     return SensRecording(intrinsics, (height, width), camera_to_world)
 
 
-def read_alignment(path: Path) -> np.ndarray | None:
-    """Read the rigid transform, (4, 4), that aligns a scan's walls with the axes; z is up.
-
-    It is among the `key = value` lines of `<scan>.txt`; None if the file has none, as for scans of
-    version 1 and test scans.
-    """
+@contextlib.contextmanager
+def open_masks(path: Path) -> Iterator["MaskArchive"]:
+    """Open a zip of masks."""
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise unreadable(path, error) from None
-    values = [line.partition("=")[2].split() for line in lines if _ALIGNMENT.match(line)]
-    if not values:
-        return None
-    words = values[-1]
-    try:
-        matrix = np.array([float(word) for word in words]).reshape(4, 4)
-    except ValueError:
+        archive = zipfile.ZipFile(path)
+    except _DAMAGE as error:
         raise InputError(
-            f"{path}: axisAlignment is {len(words)} words, expected 16 numbers. "
-            "Download the scan again."
+            f"{path} cannot be opened as a zip ({error}); download it again."
         ) from None
-    if not is_pose(matrix[None])[0]:
-        raise InputError(
-            f"{path}: axisAlignment is not a rotation with a translation: {pose_fault(matrix)}; "
-            "the file is damaged, or an axis was flipped. Download the scan again."
-        )
-    return matrix
+    with archive:
+        yield MaskArchive(path, archive)
 
 
 class MaskArchive:
@@ -191,44 +175,10 @@ class MaskArchive:
     the numbers of the frames with a mask, ascending, and `image_size` is every mask's.
     """
 
-    def __init__(self, path: Path):
-        self.path = Path(path)
-        try:
-            self._zip = zipfile.ZipFile(self.path)
-        except (OSError, zipfile.BadZipFile, NotImplementedError, ValueError) as error:
-            raise InputError(
-                f"{self.path} cannot be opened as a zip ({error}); download it again."
-            ) from None
-        try:
-            self._members = self._list()
-            self.frames = tuple(sorted(self._members))
-            width, height = self._open(self.frames[0]).size
-            self.image_size = height, width
-        except BaseException:
-            self._zip.close()
-            raise
-
-    def close(self) -> None:
-        self._zip.close()
-
-    def read(self, frame: int) -> np.ndarray:
-        """Read the mask of one frame, (height, width) uint8: objectId + 1, or 0 for no object."""
-        picture = self._open(frame)
-        width, height = picture.size
-        if (height, width) != self.image_size:
-            raise InputError(
-                f"{self._where(frame)} is {width} x {height} pixels, but the masks before it "
-                f"{self.image_size[1]} x {self.image_size[0]}; an archive has one size."
-            )
-        try:
-            # Pillow rejects truncated pictures; cv2 would pad them.
-            return np.asarray(picture).copy()
-        except (OSError, ValueError, SyntaxError, EOFError, zlib.error) as error:
-            raise self._damaged(frame, error) from None
-
-    def _list(self) -> dict[int, zipfile.ZipInfo]:
-        members: dict[int, zipfile.ZipInfo] = {}
-        for item in self._zip.infolist():
+    def __init__(self, path: Path, archive: zipfile.ZipFile):
+        self.path, self._zip = path, archive
+        self._members = members = dict[int, zipfile.ZipInfo]()
+        for item in archive.infolist():
             parts = item.filename.replace("\\", "/").split("/")
             if parts[0] == "" or ".." in parts or re.match(r"[A-Za-z]:", parts[0]):
                 raise InputError(
@@ -249,10 +199,33 @@ class MaskArchive:
             raise InputError(
                 f"{self.path} holds no masks; expected members such as instance-filt/0.png."
             )
-        return members
+        self.frames = tuple(sorted(members))
+        width, height = self._open(self.frames[0]).size
+        self.image_size = height, width
+
+    def read(self, frame: int) -> np.ndarray:
+        """Read the mask of one frame, (height, width) uint8: objectId + 1, or 0 for no object."""
+        picture = self._open(frame)
+        width, height = picture.size
+        if (height, width) != self.image_size:
+            raise InputError(
+                f"{self._where(frame)} is {width} x {height} pixels, but the masks before it "
+                f"{self.image_size[1]} x {self.image_size[0]}; an archive has one size."
+            )
+        try:
+            # Pillow rejects truncated pictures; cv2 would pad them.
+            return np.array(picture)
+        except _DAMAGE as error:
+            raise self._damaged(frame, error) from None
 
     def _open(self, frame: int) -> Image.Image:
-        data = self._bytes(frame)
+        item = self._members[frame]
+        if item.file_size > _LARGEST_MEMBER_BYTES:
+            raise self._damaged(frame, f"{item.file_size} bytes unpacked")
+        try:
+            data = self._zip.read(item)
+        except _DAMAGE as error:
+            raise self._damaged(frame, error) from None
         kind = png_kind(data)
         if kind is None:
             raise self._damaged(frame, "it is not a PNG")
@@ -264,23 +237,11 @@ class MaskArchive:
             )
         try:
             picture = Image.open(io.BytesIO(data), formats=("PNG",))
-        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+        except (*_DAMAGE, Image.DecompressionBombError):
             raise self._damaged(frame, "its header is damaged") from None
         if not 0 < picture.width * picture.height <= _LARGEST_MEMBER_BYTES:
             raise self._damaged(frame, f"{picture.width} x {picture.height} pixels")
         return picture
-
-    def _bytes(self, frame: int) -> bytes:
-        item = self._members[frame]
-        if item.file_size > _LARGEST_MEMBER_BYTES:
-            raise self._damaged(frame, f"{item.file_size} bytes unpacked")
-        try:
-            return self._zip.read(item)
-        except (
-            OSError, EOFError, ValueError, RuntimeError, zipfile.BadZipFile, zlib.error,
-        ) as error:  # fmt: skip
-            # RuntimeError means a password; NotImplementedError is a subclass.
-            raise self._damaged(frame, error) from None
 
     def _damaged(self, frame: int, why: object) -> InputError:
         return InputError(
@@ -290,3 +251,100 @@ class MaskArchive:
 
     def _where(self, frame: int) -> str:
         return f"{self.path}, {plain(self._members[frame].filename)}"
+
+
+class _Object(BaseModel):
+    objectId: _Index  # noqa: N815
+    label: str
+    segments: frozenset[_Index]
+
+
+class _Aggregation(BaseModel):
+    segGroups: list[_Object]  # noqa: N815
+
+
+class _Segmentation(BaseModel):
+    segIndices: list[_Index]  # noqa: N815
+
+
+class ScanObject(NamedTuple):
+    """One annotated object: the entries of the aggregation's `segGroups` with its number."""
+
+    object_id: int
+    category: str
+    part: np.ndarray
+    """Indices of its vertices; empty if the mesh has none of its segments."""
+
+
+class AnnotatedMesh(NamedTuple):
+    """The mesh of a scan and its annotated objects."""
+
+    mesh: Mesh
+    objects: list[ScanObject]
+    """Sorted by id."""
+    notes: list[str]
+
+
+def read_annotated_mesh(
+    mesh_path: Path, segments_path: Path, groups_path: Path, world_from_mesh: np.ndarray
+) -> AnnotatedMesh:
+    """Read the mesh, the segment of each vertex, and the objects, which are sets of segments."""
+    mesh = read_mesh(mesh_path)
+    why = "a scan without annotations (ScanNet's test scans) cannot be prepared"
+    categories: dict[int, str] = {}
+    segments_of: dict[int, frozenset[int]] = {}
+    notes = []
+    for entry in _read_json(_Aggregation, groups_path, why).segGroups:
+        number = entry.objectId
+        if number in categories:
+            notes.append(f"object {number} is listed twice; its parts were joined")
+        categories.setdefault(number, entry.label)
+        segments_of[number] = segments_of.get(number, frozenset()) | entry.segments
+    why = "it assigns the parts of the mesh to objects"
+    listed = _read_json(_Segmentation, segments_path, why).segIndices
+    if len(listed) != len(mesh.vertices_m):
+        raise InputError(
+            f"{segments_path} has {len(listed)} segIndices, but {mesh_path.name} "
+            f"{len(mesh.vertices_m)} vertices; they are not of one release, or the mesh is "
+            "truncated. Download both again."
+        )
+    segments = np.array(listed, dtype=np.int64)
+    objects = [
+        ScanObject(number, category, np.flatnonzero(np.isin(segments, [*segments_of[number]])))
+        for number, category in sorted(categories.items())
+    ]
+    vertices_m = to_camera(mesh.vertices_m, world_from_mesh)
+    return AnnotatedMesh(Mesh(vertices_m, mesh.faces), objects, notes)
+
+
+def read_mesh(path: Path) -> Mesh:
+    """Read a PLY: vertices float64, metres."""
+    from trimesh.exchange.ply import load_ply
+
+    if not path.is_file():
+        raise unreadable(path, FileNotFoundError("no such file"))
+    try:
+        # Load raw arrays, not a Trimesh, which may merge or drop vertices: segments index them.
+        with path.open("rb") as file:
+            loaded = load_ply(file, fix_texture=False, skip_materials=True)
+        vertices = np.array(loaded["vertices"], dtype=np.float64).reshape(-1, 3)
+        faces = np.array(loaded.get("faces", ()), dtype=np.int64).reshape(-1, 3)
+    except Exception as error:  # trimesh raises many types for damaged files
+        raise InputError(
+            f"{path} is not a mesh that can be read ({type(error).__name__}: {error}); "
+            "it is truncated or damaged. Download the scan again."
+        ) from None
+    if not len(vertices) or not np.isfinite(vertices).all():
+        raise InputError(f"{path} holds no vertices, or broken ones. Download the scan again.")
+    if faces.size and not (faces.min() >= 0 and faces.max() < len(vertices)):
+        raise InputError(f"{path} has triangles of vertices it lacks. Download the scan again.")
+    return Mesh(vertices, faces)
+
+
+def _read_json(model: type[_M], path: Path, why: str) -> _M:
+    if not path.is_file():
+        raise unreadable(path, FileNotFoundError("no such file"), why)
+    try:
+        return checked(model, read_json(path), str(path))
+    except InputError as error:
+        raise InputError(f"{error} Download the scan again.") from None

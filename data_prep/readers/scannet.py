@@ -6,28 +6,41 @@
 <scan>_2d-instance-filt.zip or <scan>_2d-instance.zip     masks of the objects
 """
 
-import contextlib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
 from data_prep.engine.plan import digest, seeded_split
 from data_prep.engine.source import Line, RoomTask
-from data_prep.readers.annotations import LABEL_SET, Labels, read_labels
-from data_prep.readers.frames import Y_UP, chosen_frames, mask_intrinsics, sampled_lines
+from data_prep.readers.annotations import LABEL_SET, Labels, read_labels, unreadable
+from data_prep.readers.frames import (
+    Y_UP,
+    chosen_frames,
+    is_pose,
+    mask_intrinsics,
+    pose_fault,
+    sampled_lines,
+)
 from data_prep.readers.reader import FoundRoom, Reader
 from data_prep.readers.rooms import FramedRoom, ScannedObjects
-from data_prep.readers.scan_files import MASK_FILES, MaskArchive, read_alignment, read_sens
-from data_prep.readers.scanned_mesh import AnnotatedMesh, read_annotated_mesh
+from data_prep.readers.scan_files import (
+    ScanObject,
+    open_masks,
+    read_annotated_mesh,
+    read_sens,
+)
 from sceneprior.core.checked import plain, shown
 from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.observations import thinned_stuff
 
+MASK_FILES = {"filt": "_2d-instance-filt.zip", "raw": "_2d-instance.zip"}
+"""Suffix of the archive's name, after the scan's, for each value of `--masks`."""
+_ALIGNMENT = re.compile(r"\s*axisAlignment\s*=")
 FULL_SIZE = (968, 1296)
 QUARTER_SIZE = (242, 324)
 """(height, width) of ScanNet's colour frames, and a quarter of it, the paper's rendering size."""
@@ -112,7 +125,6 @@ class ScanNet(Reader):
         """
         folder, name = self.folder / task.house, task.house
         alignment = read_alignment(folder / f"{name}.txt")
-        is_aligned = alignment is not None
         world_from_scan = Y_UP if alignment is None else Y_UP @ alignment
         scan = read_annotated_mesh(
             folder / f"{name}_vh_clean_2.ply",
@@ -121,16 +133,25 @@ class ScanNet(Reader):
             world_from_scan,
         )
         notes = [*scan.notes]
-        if not is_aligned:
+        if alignment is None:
             notes.append(
                 f"{name}.txt has no axisAlignment, which ScanNet v2's file has: the "
                 "direction of the walls is found from masks"
             )
         labels = read_labels(self.labels)
-        objects = _objects(scan, labels, notes)
-        poses, intrinsics, ids, stuff = self._views(folder, objects, notes)
+        objects = []
+        for item in scan.objects:
+            if labels.nyu40_class(item.category) is None:
+                what = f"{shown(item.category)} is not in {labels.source}, so void"
+                notes.append(f"object {item.object_id}: {what}")
+            if len(item.part):
+                objects.append(item)
+            else:
+                what = f"({plain(item.category)}) has no vertices; left out"
+                notes.append(f"object {item.object_id} {what}")
+        poses, intrinsics, ids, stuff = self._views(folder, objects, labels, notes)
         classes = label_set(LABEL_SET)
-        kinds = [classes.index(item.label) for item in objects]
+        kinds = [classes.index(labels.label(item.category)) for item in objects]
         return FramedRoom(
             where=task.room_id,
             ids=ids,
@@ -139,12 +160,12 @@ class ScanNet(Reader):
             intrinsics=intrinsics,
             stuff=stuff,
             notes=tuple(notes),
-            is_aligned=is_aligned,
+            is_aligned=alignment is not None,
             world_from_file=world_from_scan,
-            boxes={k: scan.points_m(item.row) for k, item in enumerate(objects)},
+            boxes={k: scan.mesh.vertices_m[item.part] for k, item in enumerate(objects)},
             scan=ScannedObjects(
                 scan.mesh,
-                [scan.parts[item.row] for item in objects],
+                [item.part for item in objects],
                 [f"{task.room_id}_{item.object_id:03d}" for item in objects],
             ),
             floor_of_unseen=True,
@@ -153,31 +174,9 @@ class ScanNet(Reader):
         )
 
     def _views(
-        self, folder: Path, objects: list["_Object"], notes: list[str]
+        self, folder: Path, objects: list[ScanObject], labels: Labels, notes: list[str]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Poses, intrinsics (3, 3), images of ids and of stuff, of the frames that become views."""
-        mask_path, sens_path = _mask_path(folder, self.masks), folder / f"{folder.name}.sens"
-        sens = read_sens(sens_path)
-        with contextlib.closing(MaskArchive(mask_path)) as masks:
-            choice = chosen_frames(
-                str(sens_path), sens.camera_to_world, masks.frames, self.max_views,
-                self.frame_step, f"mask in {mask_path.name}",
-                hint=" Download the scan again, or leave it out.",
-            )  # fmt: skip
-            notes += choice.notes("mask")
-            try:
-                intrinsics = mask_intrinsics(
-                    sens.intrinsics, sens.color_size, masks.image_size, self.image_size
-                )
-            except InputError as error:
-                raise InputError(f"{mask_path}: {error}") from None
-            ids, stuff = self._images(masks, choice.frames, objects, notes)
-        return sens.camera_to_world[list(choice.frames)], intrinsics, ids, stuff
-
-    def _images(
-        self, masks: MaskArchive, frames: Sequence[int], objects: list["_Object"], notes: list[str]
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Images of ids and of stuff (`FramedRoom`).
+        """Poses, intrinsics (3, 3), images of ids and of stuff, of the frames that become views.
 
         An image of ids shows that two objects touch, but not which one is in front. So a side is
         clear if no other furniture, void included, touches it. The room's shell (walls, floor,
@@ -193,70 +192,79 @@ class ScanNet(Reader):
         for k, item in enumerate(objects, start=1):
             if item.object_id < 255:  # an 8-bit mask cannot show more
                 known.append(item.object_id + 1)
-                table[known[-1]] = 0 if item.is_shell else k
-                stuff_table[known[-1]] = item.stuff
-        images, stuff, unlisted = [], [], set()
-        sizes = zip(masks.image_size, self.image_size, strict=True)
-        lines = np.ix_(*(sampled_lines(*size) for size in sizes))
-        for frame in frames:
-            values = masks.read(frame)[lines]
-            images.append(table[values])
-            stuff.append(stuff_table[thinned_stuff(values)])
-            unlisted.update(np.setdiff1d(values, known).tolist())
+                table[known[-1]] = 0 if labels.is_shell(item.category) else k
+                stuff_table[known[-1]] = labels.stuff(item.category)
+        mask_path, sens_path = self._mask_path(folder), folder / f"{folder.name}.sens"
+        sens = read_sens(sens_path)
+        images, stuff, unlisted = [], [], set[int]()
+        with open_masks(mask_path) as masks:
+            choice = chosen_frames(
+                str(sens_path), sens.camera_to_world, masks.frames, self.max_views,
+                self.frame_step, f"mask in {mask_path.name}",
+                hint=" Download the scan again, or leave it out.",
+            )  # fmt: skip
+            notes += choice.notes("mask")
+            try:
+                intrinsics = mask_intrinsics(
+                    sens.intrinsics, sens.color_size, masks.image_size, self.image_size
+                )
+            except InputError as error:
+                raise InputError(f"{mask_path}: {error}") from None
+            sizes = zip(masks.image_size, self.image_size, strict=True)
+            lines = np.ix_(*(sampled_lines(*size) for size in sizes))
+            for frame in choice.frames:
+                values = masks.read(frame)[lines]
+                images.append(table[values])
+                stuff.append(stuff_table[thinned_stuff(values)])
+                unlisted.update(np.setdiff1d(values, known).tolist())
         if unlisted:
             listed = ", ".join(str(value - 1) for value in sorted(unlisted))
             notes.append(f"masks show objects that the aggregation does not have ({listed}): void")
-        return np.stack(images), np.stack(stuff)
+        poses = sens.camera_to_world[list(choice.frames)]
+        return poses, intrinsics, np.stack(images), np.stack(stuff)
+
+    def _mask_path(self, scan: Path) -> Path:
+        paths = {name: scan / f"{scan.name}{ending}" for name, ending in MASK_FILES.items()}
+        if paths[self.masks].is_file():
+            return paths[self.masks]
+        others = [
+            f" (or give --masks {name}, whose archive is here)"
+            for name, path in paths.items()
+            if path.is_file()
+        ]
+        raise InputError(
+            f"{paths[self.masks]} is missing: the instance masks. Download it into the scan's "
+            f"folder{''.join(others)}."
+        )
 
 
-def _mask_path(scan: Path, kind: str) -> Path:
-    paths = {name: scan / f"{scan.name}{ending}" for name, ending in MASK_FILES.items()}
-    if paths[kind].is_file():
-        return paths[kind]
-    others = [
-        f" (or give --masks {name}, whose archive is here)"
-        for name, path in paths.items()
-        if path.is_file()
-    ]
-    raise InputError(
-        f"{paths[kind]} is missing: the instance masks. Download it into the scan's folder"
-        f"{''.join(others)}."
-    )
+def read_alignment(path: Path) -> np.ndarray | None:
+    """Read the rigid transform, (4, 4), that aligns a scan's walls with the axes; z is up.
 
-
-class _Object(NamedTuple):
-    """One annotated object with vertices."""
-
-    row: int
-    """Index into the groups of the mesh."""
-    object_id: int
-    """Id of the object; its value in the masks is one more."""
-    label: str
-    """Class of the label set `scannet`; `void` outside its 19 classes."""
-    is_shell: bool
-    """True for a part of the room (wall, floor, ...), false for furniture."""
-    stuff: int
-    """Index into `STUFF`."""
-
-
-def _objects(scan: AnnotatedMesh, labels: Labels, notes: list[str]) -> list[_Object]:
-    """Objects of a scan in the order of their ids, without those that have no vertices."""
-    objects = []
-    for row, group in enumerate(scan.groups):
-        if labels.nyu40_class(group.category) is None:
-            notes.append(
-                f"object {group.object_id}: {shown(group.category)} is not in {labels.source}, so "
-                "void"
-            )
-        if not len(scan.parts[row]):
-            notes.append(
-                f"object {group.object_id} ({plain(group.category)}) has no vertices; left out"
-            )
-            continue
-        kind, stuff = labels.label(group.category), labels.stuff(group.category)
-        is_shell = labels.is_shell(group.category)
-        objects.append(_Object(row, group.object_id, kind, is_shell, stuff))
-    return objects
+    It is among the `key = value` lines of `<scan>.txt`; None if the file has none, as for scans of
+    version 1 and test scans.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise unreadable(path, error) from None
+    values = [line.partition("=")[2].split() for line in lines if _ALIGNMENT.match(line)]
+    if not values:
+        return None
+    words = values[-1]
+    try:
+        matrix = np.array([float(word) for word in words]).reshape(4, 4)
+    except ValueError:
+        raise InputError(
+            f"{path}: axisAlignment is {len(words)} words, expected 16 numbers. "
+            "Download the scan again."
+        ) from None
+    if not is_pose(matrix[None])[0]:
+        raise InputError(
+            f"{path}: axisAlignment is not a rotation with a translation: {pose_fault(matrix)}; "
+            "the file is damaged, or an axis was flipped. Download the scan again."
+        )
+    return matrix
 
 
 def find_scans(folder: Path) -> list[Path]:
@@ -300,9 +308,20 @@ def split_scans(
     """
     listed: dict[str, str] = {}
     for path, split in ((train, "train"), (val, "test")):
-        for scan_id in [] if path is None else _read_list(path):
-            if listed.setdefault(scan_id, split) != split:
-                raise InputError(f"{scan_id} is in both {train} and {val}; a scan has one split.")
+        if path is None:
+            continue
+        try:
+            lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(f"The list of scans {path} cannot be read ({error}).") from None
+        for number, line in enumerate(lines, 1):
+            if re.search(r"[\s,;]", line):
+                raise InputError(
+                    f"{path}, line {number}: '{line[:60]}' is not a scan id; expected one "
+                    "(scene0000_00) a line, as in scannetv2_train.txt."
+                )
+            if line and listed.setdefault(line, split) != split:
+                raise InputError(f"{line} is in both {train} and {val}; a scan has one split.")
     split_of = {name: listed[name] for name in scan_ids if name in listed}
     if not split_of:
         lists = " and ".join(str(path) for path in (train, val) if path is not None)
@@ -312,17 +331,3 @@ def split_scans(
             "scannetv2_val.txt."
         )
     return split_of, [name for name in listed if name not in split_of]
-
-
-def _read_list(path: Path) -> list[str]:
-    try:
-        lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"The list of scans {path} cannot be read ({error}).") from None
-    for number, line in enumerate(lines, 1):
-        if re.search(r"[\s,;]", line):
-            raise InputError(
-                f"{path}, line {number}: '{line[:60]}' is not a scan id; expected one "
-                "(scene0000_00) a line, as in scannetv2_train.txt."
-            )
-    return [line for line in lines if line]

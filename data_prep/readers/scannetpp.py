@@ -30,8 +30,8 @@ from data_prep.readers.posed.captures import read_model
 from data_prep.readers.posed.recording import PosedFrame, frame_intrinsics
 from data_prep.readers.posed.transforms import FILE_NAME, read_recording
 from data_prep.readers.reader import FoundRoom, Reader
-from data_prep.readers.rooms import FramedRoom, numbered
-from data_prep.readers.scanned_mesh import AnnotatedMesh, focal_and_center, read_annotated_mesh
+from data_prep.readers.rooms import FramedRoom, focal_and_center, numbered
+from data_prep.readers.scan_files import AnnotatedMesh, read_annotated_mesh
 from sceneprior.core.checked import checked
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
@@ -110,13 +110,16 @@ class ScanNetPP(Reader):
         # The last entry is for pixels without a face.
         ids = np.append(_most_common(vertex_ids[mesh.faces]), np.int32(-1))[faces]
         stuff = np.append(_most_common(vertex_stuff[mesh.faces]), np.uint8(0))[faces]
-        points = {k + 1: scan.points_m(k) for k, part in enumerate(scan.parts) if len(part)}
-        floors = [
-            scan.points_m(k)[:, 1]
-            for k, group in enumerate(scan.groups)
-            if labels.nyu40_class(group.category) == "floor"
-        ]
-        heights = np.concatenate([np.zeros(0), *floors])
+        points = {k: mesh.vertices_m[item.part] for k, item in enumerate(scan.objects, start=1)}
+        points = {k: own for k, own in points.items() if len(own)}
+        heights = np.concatenate(
+            [
+                mesh.vertices_m[item.part, 1]
+                for item in scan.objects
+                if labels.nyu40_class(item.category) == "floor"
+            ]
+            or [np.zeros(0)]
+        )
         notes = (*scan.notes, *choice.notes("image of ids"))
         return FramedRoom(
             **numbered(ids, classes, self.label_set, task.room_id, points, stuff, notes),
@@ -182,17 +185,16 @@ def _ids(scan: AnnotatedMesh, labels: Labels) -> tuple[np.ndarray, np.ndarray, d
     """Number of each vertex, (V,) int32: k + 1 for group k, 0 for the room itself, -1 for no group;
     index into `STUFF` of each vertex, uint8; and the classes. A vertex that several groups share
     belongs to the smallest of them."""
-    groups, parts = scan.groups, scan.parts
     numbers = np.full(len(scan.mesh.vertices_m), -1, dtype=np.int32)
     stuff = np.zeros(len(numbers), dtype=np.uint8)
     classes = {}
-    for k in sorted(range(len(groups)), key=lambda k: -len(parts[k])):
-        is_shell = labels.is_shell(groups[k].category)
-        numbers[parts[k]] = 0 if is_shell else k + 1
-        stuff[parts[k]] = labels.stuff(groups[k].category)
-        if not is_shell and len(parts[k]):
-            name = labels.label(groups[k].category)
-            classes[k + 1] = groups[k].category if name == "void" else name
+    for k, item in sorted(enumerate(scan.objects, start=1), key=lambda pair: -len(pair[1].part)):
+        is_shell = labels.is_shell(item.category)
+        numbers[item.part] = 0 if is_shell else k
+        stuff[item.part] = labels.stuff(item.category)
+        if not is_shell and len(item.part):
+            name = labels.label(item.category)
+            classes[k] = item.category if name == "void" else name
     return numbers, stuff, classes
 
 

@@ -24,7 +24,7 @@ from data_prep.engine.source import Line, RoomTask, pool
 from data_prep.readers import DATA_SETS, open_reader
 from data_prep.readers.posed.formats import read_formats, read_label_set
 from data_prep.readers.posed.reader import Posed, find_rooms
-from data_prep.readers.scan_files import MaskArchive, read_sens
+from data_prep.readers.scan_files import open_masks, read_sens
 from data_prep.readers.scannet import ScanNet, find_scans, split_scans
 from sceneprior.core.errors import InputError
 
@@ -494,7 +494,7 @@ def test_options_that_cannot_be(tmp_path):
         "scans | none": lambda: find_scans(tmp_path / "empty"),
         "scannet | masks": lambda: ScanNet(tmp_path, labels=tmp_path, masks="best"),
         "scannet | step": lambda: ScanNet(tmp_path, labels=tmp_path, frame_step=0),
-        "zip | no file": lambda: MaskArchive(tmp_path / "a.zip"),
+        "zip | no file": open_masks(tmp_path / "a.zip").__enter__,
         "splits | no file": lambda: read_splits(tmp_path / "a.csv"),
         "lists | none": lambda: split_scans(["scene0000_00"], None, None),
         **{f"data set | no {name}": lambda name=name: open_reader(name, tmp_path)

@@ -5,7 +5,6 @@ import json
 import shutil
 import tracemalloc
 import zlib
-from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -32,16 +31,16 @@ from data_prep.engine.source import Line, RoomTask, pool
 from data_prep.inspection.agreement import true_bodies
 from data_prep.inspection.verify import agreement_of, verify
 from data_prep.readers.annotations import read_labels
-from data_prep.readers.rooms import prepare_room
-from data_prep.readers.scan_files import MaskArchive, read_alignment, read_sens
-from data_prep.readers.scanned_mesh import (
-    Group,
-    focal_and_center,
-    read_groups,
-    read_mesh,
-    unoccluded,
+from data_prep.readers.rooms import focal_and_center, prepare_room, unoccluded
+from data_prep.readers.scan_files import open_masks, read_mesh, read_sens
+from data_prep.readers.scannet import (
+    FULL_SIZE,
+    QUARTER_SIZE,
+    ScanNet,
+    find_scans,
+    read_alignment,
+    split_scans,
 )
-from data_prep.readers.scannet import FULL_SIZE, QUARTER_SIZE, ScanNet, find_scans, split_scans
 from sceneprior.core.classes import STUFF, label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.shard_writing import room_checksum
@@ -119,8 +118,11 @@ def test_recordings_and_archives_cut_anywhere_are_refused_by_name(tmp_path):
     data = write_zip(tmp_path / "a.zip", masks).read_bytes()
     for end in range(0, len(data), 3):
         (tmp_path / "cut.zip").write_bytes(data[:end])
-        with pytest.raises(InputError, match=r"cut\.zip cannot be opened as a zip"):
-            MaskArchive(tmp_path / "cut.zip")
+        with (
+            pytest.raises(InputError, match=r"cut\.zip cannot be opened as a zip"),
+            open_masks(tmp_path / "cut.zip"),
+        ):
+            pass
 
 
 def mask(seed=0, height=12, width=16):
@@ -137,7 +139,7 @@ def test_masks_are_read_in_place(tmp_path):
         "readme.txt": b"",
     }
     path = write_zip(tmp_path / "a.zip", members)
-    with closing(MaskArchive(path)) as archive:
+    with open_masks(path) as archive:
         assert archive.frames == (0, 15, 30) and archive.image_size == (12, 16)
         for seed, frame in ((2, 30), (0, 0), (1, 15)):
             values = archive.read(frame)
@@ -156,18 +158,21 @@ def test_members_that_are_no_readable_picture(tmp_path):
     for name, data in cases.items():
         with (
             refused(f"readers/member | {name}", tmp=tmp_path),
-            closing(MaskArchive(write_zip(tmp_path / "a.zip", {"0.png": data}))) as archive,
+            open_masks(write_zip(tmp_path / "a.zip", {"0.png": data})) as archive,
         ):
             archive.read(0)
     data = bytearray(write_zip(tmp_path / "a.zip", {"0.png": png(mask())}).read_bytes())
     data[6] |= 1
     data[data.index(b"PK\x01\x02") + 8] |= 1
     (tmp_path / "a.zip").write_bytes(data)
-    with refused("readers/member | password", tmp=tmp_path):
-        MaskArchive(tmp_path / "a.zip")
+    with (
+        refused("readers/member | password", tmp=tmp_path),
+        open_masks(tmp_path / "a.zip"),
+    ):
+        pass
 
 
-def test_properties_alignment_and_groups(tmp_path):
+def test_the_alignment_is_among_the_properties(tmp_path):
     path = tmp_path / "a.txt"
     path.write_text("sceneType = Bedroom / Hotel\n\nno pair\n")
     assert read_alignment(path) is None
@@ -178,11 +183,6 @@ def test_properties_alignment_and_groups(tmp_path):
         [0, 0, 1, 4],
         [0, 0, 0, 1],
     ]
-    rows = [(5, "bed", [1]), (2, "chair", [2]), (5, "sofa", [7])]
-    groups = [{"objectId": k, "label": name, "segments": parts} for k, name, parts in rows]
-    path.write_text(json.dumps({"segGroups": groups}))
-    found = [Group(2, "chair", frozenset({2})), Group(5, "bed", frozenset({1, 7}))]
-    assert read_groups(path) == (found, ["object 5 is listed twice; its parts were joined"])
 
 
 def test_a_mesh_cut_anywhere(tmp_path, rng):
@@ -260,10 +260,12 @@ def test_notes_tell_what_was_left_out(scan, reader):
     scan.write()
     data = json.loads(scan.path(".aggregation.json").read_text())
     data["segGroups"].append({"objectId": 40, "label": "bed", "segments": [999]})
+    data["segGroups"].append({"objectId": 2, "label": "sofa", "segments": []})
     scan.path(".aggregation.json").write_text(json.dumps(data))
     masks = {f"{frame}.png": png(scan.mask(frame, (242, 324))) for frame in (0, 2, 3, 5)}
     write_zip(scan.path("_2d-instance-filt.zip"), masks)
     assert reader.prepare(task_of(scan), None).notes == (
+        "object 2 is listed twice; its parts were joined",
         "object 3: 'never heard of' is not in labels.tsv, so void",
         "object 40 (bed) has no vertices; left out",
         "1 of 6 frames have no usable pose; skipped",
@@ -420,7 +422,7 @@ def test_whole_objects_are_those_drawn_the_same_alone(right):
     room = reader.read(task_of(scan))
     mesh, parts, cameras = room.scan.mesh, room.scan.parts, np.linalg.inv(room.camera_to_world)
     chosen = np.flatnonzero(room.object_class[:-1])
-    found = unoccluded(mesh, parts, [*chosen, len(parts)], cameras, room.intrinsics, QUARTER_SIZE)
+    found = unoccluded(room.scan, [*chosen, len(parts)], cameras, room.intrinsics, QUARTER_SIZE)
     assert not found[:, -1].any()  # ids without an object
     lens = focal_and_center(room.intrinsics)
     agree = wanted = 0
