@@ -19,7 +19,7 @@ from sceneprior.training.method import RunConfig, Trained, TrainedReconstructor,
 METHODS = {
     "paper": "sceneprior.paper.config:PaperConfig",
     "lifted": "sceneprior.lifted.config:LiftedConfig",
-    "gan": "sceneprior.baselines.gan.stage:GanConfig",
+    "gan": "sceneprior.baselines.gan:GanConfig",
     "atiss": "sceneprior.baselines.atiss:AtissConfig",
     "sync2gen": "sceneprior.baselines.sync2gen:Sync2genConfig",
     "set_flow": "sceneprior.baselines.set_flow:SetFlowConfig",

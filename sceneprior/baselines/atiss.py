@@ -13,10 +13,9 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from sceneprior.baselines.one_stage import OneStage, OneStageTraining
-from sceneprior.baselines.true_boxes import BoxConfig, room_means
+from sceneprior.baselines.decoders import EncoderConfig
+from sceneprior.baselines.one_stage import BoxConfig, OneStage, OneStageTraining, room_means
 from sceneprior.core.mixtures import draw_index
-from sceneprior.core.settings import Section
 from sceneprior.core.views import RoomBoxes
 from sceneprior.paper.decoders import mlp
 from sceneprior.training.steps import batch_seed, full_precision
@@ -86,28 +85,6 @@ OCTAVES = 8
 mixture; the published 32 octaves exceed the precision of float32."""
 BATCH = 256
 """Rooms per batch in sampling."""
-
-
-class EncoderConfig(Section):
-    """Size of the encoder of ATISS and of ATISS-2D; the defaults are the published settings."""
-
-    layers: int = Field(4, ge=1, le=100)
-    heads: int = Field(8, ge=1)
-    """Attention heads; must divide the width."""
-    hidden: int = Field(1024, ge=8)
-    """Inner width of the feed-forward layers."""
-    dropout: float = Field(0.1, ge=0, lt=1)
-
-    def build_layers(self, width: int, norm_first: bool = False) -> nn.ModuleList:
-        """Freshly initialised layers, each with its own weights. `nn.TransformerEncoder` would
-        start with copies of one layer."""
-        return nn.ModuleList(
-            nn.TransformerEncoderLayer(
-                width, self.heads, self.hidden, self.dropout, "gelu",
-                batch_first=True, norm_first=norm_first,
-            )
-            for _ in range(self.layers)
-        )  # fmt: skip
 
 
 class SetModel(EncoderConfig):
@@ -283,17 +260,13 @@ class AtissConfig(BoxConfig):
     training: AtissTraining = AtissTraining()
 
     def make(self) -> "AtissStage":
-        return AtissStage(Atiss(self.model, self.classes), self.training, self.seed)
+        return AtissStage(Atiss(self.model, self.classes), self)
 
 
 class AtissStage(OneStage):
     """Maximises the likelihood of one object of each room, given some of the others."""
 
     prior: Atiss
-
-    def __init__(self, prior: Atiss, settings: AtissTraining, seed: int):
-        super().__init__(prior, settings)
-        self.seed = seed
 
     def training_step(self, rooms: RoomBoxes, batch_idx: int) -> Tensor:
         placed, coming = part_of_rooms(rooms, batch_seed(self.seed, self.trainer, batch_idx))
@@ -303,7 +276,7 @@ class AtissStage(OneStage):
             next_class = coming.object_class[:, 0]
             log_probs = self.prior.log_prob(context.float(), next_class, next_unit[:, 0])
             losses = {name: -log_prob for name, log_prob in log_probs.items()}
-            return self.total(room_means(losses, rooms), {}, rooms)
+            return self.total(room_means(losses, rooms), rooms)
 
 
 def part_of_rooms(rooms: RoomBoxes, seed: int) -> tuple[RoomBoxes, RoomBoxes]:

@@ -14,8 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sceneprior.baselines.atiss import OCTAVES, SetModel, fourier_features
-from sceneprior.baselines.one_stage import OneStage, OneStageTraining
-from sceneprior.baselines.true_boxes import BoxConfig, room_means
+from sceneprior.baselines.one_stage import BoxConfig, OneStage, OneStageTraining, room_means
 from sceneprior.core.mixtures import draw_index
 from sceneprior.core.views import RoomBoxes
 from sceneprior.paper.decoders import mlp
@@ -220,7 +219,7 @@ class SetFlowConfig(BoxConfig):
     training: SetFlowTraining = SetFlowTraining()
 
     def make(self) -> "SetFlowStage":
-        return SetFlowStage(SetFlow(self.model, self.classes), self.training)
+        return SetFlowStage(SetFlow(self.model, self.classes), self)
 
 
 class SetFlowStage(OneStage):
@@ -244,7 +243,7 @@ class SetFlowStage(OneStage):
             true = (rooms.object_class - 1).clamp(min=0).unsqueeze(-1)
             entropy = -logits.float().log_softmax(dim=-1).gather(-1, true)[..., 0]
             losses["class"] = (entropy * is_object).sum(dim=1)
-            return self.total(room_means(losses, rooms), {}, rooms)
+            return self.total(room_means(losses, rooms), rooms)
 
 
 def matched(

@@ -16,8 +16,7 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from sceneprior.baselines.one_stage import OneStage, OneStageTraining
-from sceneprior.baselines.true_boxes import BoxConfig, room_means
+from sceneprior.baselines.one_stage import BoxConfig, OneStage, OneStageTraining, room_means
 from sceneprior.core.settings import Section
 from sceneprior.core.views import RoomBoxes
 from sceneprior.paper.decoders import mlp
@@ -309,6 +308,9 @@ class Sync2genTraining(OneStageTraining):
     """Weight of the KL divergence from N(0, 1). A larger weight makes new rooms better but less
     varied; a smaller one reconstructs training rooms better, but makes new rooms worse."""
 
+    def weight_of(self, loss: str) -> float:
+        return self.kl_weight if loss == "kl" else 1.0
+
 
 class Sync2genConfig(BoxConfig):
     """Config of a run of the Sync2Gen-style VAE."""
@@ -318,15 +320,13 @@ class Sync2genConfig(BoxConfig):
     training: Sync2genTraining = Sync2genTraining()
 
     def make(self) -> "Sync2genStage":
-        network = Sync2Gen(self.model, self.classes, self.seed)
-        return Sync2genStage(network, self.training)
+        return Sync2genStage(Sync2Gen(self.model, self.classes, self.seed), self)
 
 
 class Sync2genStage(OneStage):
     """Minimises reconstruction errors and the KL divergence of latents from N(0, 1)."""
 
     prior: Sync2Gen
-    settings: Sync2genTraining
 
     def training_step(self, rooms: RoomBoxes, batch_idx: int) -> Tensor:
         matrix = self.prior.to_matrix(rooms)
@@ -340,5 +340,4 @@ class Sync2genStage(OneStage):
             self.prior.note_errors(matrix, decoded)
             objects = rooms.is_object.sum()
             left_out = (objects - matrix[..., 0].sum()) / objects.clamp(min=1)
-            weights = {"kl": self.settings.kl_weight}
-            return self.total(room_means(losses, rooms), weights, rooms, {"left_out": left_out})
+            return self.total(room_means(losses, rooms), rooms, left_out=left_out)

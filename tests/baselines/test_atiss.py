@@ -18,7 +18,7 @@ from sceneprior.baselines.atiss import (
     LogisticMixture,
     part_of_rooms,
 )
-from sceneprior.baselines.true_boxes import TruthDataset
+from sceneprior.baselines.one_stage import TruthDataset
 from sceneprior.core.views import RoomBoxes
 
 

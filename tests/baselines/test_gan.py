@@ -7,17 +7,15 @@ import torch
 import trimesh
 from torch.testing import assert_close
 
-from sceneprior.baselines.gan.losses import (
-    adversarial_loss,
-)
-from sceneprior.baselines.gan.semantic_maps import (
+from sceneprior.baselines.gan import GanStage
+from sceneprior.baselines.semantic_maps import (
     POOLING,
+    adversarial_loss,
     choices,
     compose_maps,
     observed_maps,
     rendered_maps,
 )
-from sceneprior.baselines.gan.stage import GanStage
 from sceneprior.core.classes import VOID
 from sceneprior.core.dataset import ViewDataset
 from sceneprior.core.proxies import place
@@ -87,7 +85,7 @@ def test_the_true_room_looks_as_it_was_seen(views, toy_shards):
 
 
 def drawn_maps(scenes: DecodedScenes, views) -> torch.Tensor:
-    return rendered_maps(scenes, FACES, views, *choices(scenes))
+    return rendered_maps(scenes, FACES, views, *choices(scenes, "first_n"), "fast")
 
 
 def whole(scenes: DecodedScenes, views) -> torch.Tensor:
@@ -133,7 +131,7 @@ def test_choices_are_hard_and_their_gradients_soft(torch_rng):
     labels, complete = (part.requires_grad_() for part in (numbers[..., :5], numbers[..., 5]))
     scenes = DecodedScenes(labels, numbers[..., :3], numbers[..., :3], complete)
     weights = torch.randn(2, 3, 5, generator=torch_rng, dtype=torch.float64)
-    kept, classes = choices(scenes)
+    kept, classes = choices(scenes, "first_n")
     assert torch.equal(classes.detach().round(), torch.nn.functional.one_hot(labels.argmax(-1), 5))
     assert torch.equal(kept.detach() > 0.5, kept_objects(complete, "first_n"))
     (wanted,) = torch.autograd.grad((labels.softmax(dim=-1) * weights).sum(), labels)

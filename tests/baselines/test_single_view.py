@@ -11,17 +11,17 @@ from torch.testing import assert_close
 from sceneprior.apps.config import load_any_run
 from sceneprior.apps.reconstruction.reconstruct import FitOptions, reconstruct
 from sceneprior.baselines.single_view.detections import CROP, detections_of, some_views
-from sceneprior.baselines.single_view.im3d import LEVEL, STEEP, occupancy_logits
-from sceneprior.baselines.single_view.total3d import (
+from sceneprior.baselines.single_view.detector import (
     BIN,
     BINS,
     NEAREST_M,
     Estimate,
     TrueObjects,
+    TrueViewDataset,
     estimate_losses,
     true_objects,
 )
-from sceneprior.baselines.single_view.truth import TrueViewDataset
+from sceneprior.baselines.single_view.im3d import LEVEL, STEEP, occupancy_logits
 from sceneprior.baselines.single_view.usl import silhouette_loss
 from sceneprior.core.boxes import turn_vectors
 from sceneprior.core.dataset import ViewDataset

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 import sceneprior
-from sceneprior.baselines.true_boxes import TruthDataset
+from sceneprior.baselines.one_stage import TruthDataset
 from sceneprior.core.dataset import BLANK, ViewDataset
 from sceneprior.core.shards import iterate_rooms
 
@@ -90,14 +90,15 @@ def test_only_baselines_with_3d_supervision_read_the_ground_truth():
                 for alias in node.names:
                     importers[alias.name].add(name)
     assert importers["read_ground_truth"] == {
-        "baselines/true_boxes.py", "core/ground_truth.py", "apps/retrieval/model_folders.py"
+        "baselines/one_stage.py", "core/ground_truth.py", "apps/retrieval/cad_models.py"
     }  # fmt: skip
     trains = ("paper/", "lifted/", "training/", "baselines/")
     readers = {n for n in importers["sceneprior.core.ground_truth"] if n.startswith(trains)}
     views = "baselines/single_view"
-    assert readers == {f"{views}/truth.py", "lifted/reconstruction/known_rooms.py"}
+    assert readers == {f"{views}/detector.py", "lifted/reconstruction/known_rooms.py"}
     assert importers["TruthDataset"] == set()
     assert importers["BoxConfig"] == {
         f"baselines/{name}.py" for name in ("atiss", "sync2gen", "set_flow")
     }
-    assert importers["TrueViewDataset"] == {f"{views}/total3d.py"}
+    assert importers["TrueViewDataset"] == set()
+    assert importers["DetectorConfig"] == {f"{views}/{name}.py" for name in ("total3d", "im3d")}

@@ -21,9 +21,16 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sceneprior.baselines.one_stage import OneStage
-from sceneprior.baselines.single_view.detections import Detections, detections_of
-from sceneprior.baselines.single_view.network import Placed, ViewNetwork, as_numpy, last_layer
-from sceneprior.baselines.single_view.total3d import (
+from sceneprior.baselines.single_view.detections import (
+    Detections,
+    Placed,
+    ViewNetwork,
+    as_numpy,
+    detections_of,
+    last_layer,
+)
+from sceneprior.baselines.single_view.detector import (
+    CELLS,
     GEOMETRY,
     CameraBoxes,
     Detector,
@@ -32,6 +39,7 @@ from sceneprior.baselines.single_view.total3d import (
     DetectorTraining,
     Estimate,
     TrueObjects,
+    TrueViews,
     corner_loss,
     estimate_losses,
     mean_of_masks,
@@ -40,7 +48,6 @@ from sceneprior.baselines.single_view.total3d import (
     smooth_l1,
     true_objects,
 )
-from sceneprior.baselines.single_view.truth import CELLS, TrueViews
 from sceneprior.core.boxes import turn_vectors
 from sceneprior.core.scene import Mesh
 from sceneprior.core.surfaces import surface_of
@@ -81,7 +88,7 @@ class Im3dConfig(DetectorConfig):
     training: Im3dTraining = Im3dTraining()
 
     def make(self) -> "Im3dStage":
-        return Im3dStage(Im3d(self.model, self.classes), self.training)
+        return Im3dStage(Im3d(self.model, self.classes), self)
 
 
 class SceneGraph(nn.Module):
@@ -222,7 +229,7 @@ class Im3dStage(OneStage):
             )
             losses["shape"] = occupancy_loss(found, blobs, true, self.settings.points)
             losses["overlap"] = overlap_loss(found, refined.in_room(found), blobs.detach())
-            return self.total(losses, self.settings.weights(losses), batch.views)
+            return self.total(losses, batch.views)
 
 
 def occupancy_loss(

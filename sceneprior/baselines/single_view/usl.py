@@ -12,16 +12,18 @@ from pydantic import Field
 from torch import Tensor
 
 from sceneprior.baselines.one_stage import OneStage
-from sceneprior.baselines.single_view.detections import Detections, detections_of, some_views
-from sceneprior.baselines.single_view.network import (
+from sceneprior.baselines.single_view.detections import (
     DetectionEncoder,
+    Detections,
     Placed,
     SingleViewConfig,
     SingleViewModel,
     SingleViewTraining,
     ViewNetwork,
+    detections_of,
     last_layer,
     meshes_of,
+    some_views,
 )
 from sceneprior.core.cameras import boxes_of_points
 from sceneprior.core.scene import Mesh
@@ -68,7 +70,7 @@ class UslConfig(SingleViewConfig):
     training: UslTraining = UslTraining()
 
     def make(self) -> "UslStage":
-        return UslStage(Usl(self.model, self.classes), self.training)
+        return UslStage(Usl(self.model, self.classes), self)
 
 
 class Usl(ViewNetwork):
@@ -91,7 +93,7 @@ class Usl(ViewNetwork):
         seen_m = sides / found.intrinsics[:, (0, 1), (0, 1)] * distances_m.unsqueeze(-1)
         width_m, height_m = seen_m.unbind(dim=-1)
         sizes_m = torch.stack([width_m, height_m, width_m], dim=-1) * log_sizes.exp()
-        placed = Placed.of(found, offsets, distances_m, sizes_m)
+        placed = Placed(found.centers_at(offsets, distances_m), found.to_room(sizes_m).abs())
         vertices = self.shape(features.unsqueeze(0))[0]
         return placed, placed.points_m(found, vertices)
 
@@ -114,8 +116,7 @@ class UslStage(OneStage):
             losses = other_view_losses(
                 found, placed, vertices_m, self.prior.shape.faces, others, self.settings
             )
-            weights = self.settings.model_dump(include=set(losses))
-            return self.total(losses, weights, views)
+            return self.total(losses, views)
 
 
 def other_view_losses(

@@ -8,7 +8,7 @@ import torch
 from references import losses as by_hand
 from torch.testing import assert_close
 
-from sceneprior.baselines.gan.semantic_maps import kept_share
+from sceneprior.baselines.semantic_maps import kept_share
 from sceneprior.core.boxes import box_corners
 from sceneprior.core.cameras import boxes_of_points
 from sceneprior.paper.losses import (

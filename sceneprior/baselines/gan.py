@@ -12,22 +12,20 @@ from jaxtyping import Float
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from pydantic import Field
 from torch import Tensor, nn
+from torch.nn import functional as F
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
-from sceneprior.baselines.gan.losses import (
+from sceneprior.baselines.semantic_maps import (
     MapDiscriminator,
     adversarial_loss,
-    bounds_penalty,
-    contents,
-    diversity_loss,
-    logit_penalty,
-)
-from sceneprior.baselines.gan.semantic_maps import (
     choices,
+    contents,
     observed_counts,
     observed_maps,
     rendered_maps,
 )
+from sceneprior.core.cameras import camera_centers
+from sceneprior.core.classes import VOID
 from sceneprior.core.dataset import ViewDataset
 from sceneprior.core.views import DecodedScenes, SceneViews
 from sceneprior.paper.decoders import LayoutDecoder, ShapeDecoderConfig
@@ -39,25 +37,27 @@ from sceneprior.training.steps import check_finite, full_precision, log_losses
 BETAS = (0.0, 0.99)
 """Betas of both Adam optimisers. There is no momentum, because it would average gradients against
 earlier states of the other network."""
-
 STARTS = ((0.0, 1.2), (0.4, 0.4), (0.0, 1.2), (0.4, 0.5), (0.4, 0.5), (0.4, 0.5), (1.5, 1.0))
 """Mean and standard deviation, over rooms and objects, of the untrained layout decoder's outputs:
 x, y, z in metres, width, height, depth before their SoftPlus, and completeness."""
-
 START_ROOMS = 64
 """Number of random rooms over which the outputs are set to `STARTS`."""
-
 SHAPE_RATE = 0.1
 """Learning rate of the shape decoder, relative to the generator's. It is low, because semantic maps
 do not rule out sheared boxes."""
-
 LOGIT_PENALTY = 0.01
 """Weight of `logit_penalty`. Without it, choices could become almost certain and lose their
 gradient, and a generator that has lost all objects could not recover."""
-
 BOUNDS_PENALTY = 10.0
 """Weight of `bounds_penalty`."""
-
+VARIED = (1.5, 1.5, 0.3, 0.3, 0.3)
+"""Target standard deviation over rooms, in metres, of the k-th object's x, z, width, height and
+depth."""
+MARGIN_M, CEILING_M = 0.5, 3.0
+"""Bounds of generated boxes in metres. Along x and z, they are `MARGIN_M` beyond the batch's
+furthest camera from the floor centre; along y, they are the floor and `CEILING_M`."""
+SIZES_M = (0.1, 2.5)
+"""Bounds of generated sizes in metres."""
 MEMORY = 0.9
 """Decay per step of the running mean `excess`. A single batch has too few objects of rare
 classes."""
@@ -156,7 +156,11 @@ class GanStage(lightning.LightningModule):
             undecided = logit_penalty(scenes)
             check_finite(undecided + scenes.centers_m.sum() + scenes.sizes_m.sum(), views.room_ids)
             real = observed_maps(views, self.classes)
-            fake, counts = self._draw(scenes, views)
+            kept, chosen = choices(scenes, self.model.completeness_target)
+            faces = self.generator.faces
+            assert faces is not None, "GanModel has meshes"
+            fake = rendered_maps(scenes, faces, views, kept, chosen, self.settings.silhouettes)
+            counts = (kept.unsqueeze(-1) * chosen).sum(dim=1)
             more = contents(fake, counts) - contents(real, observed_counts(views, self.classes))
             self.excess.lerp_(more.detach().mean(dim=0), 1 - MEMORY)
             loss = LOGIT_PENALTY * undecided + BOUNDS_PENALTY * bounds_penalty(scenes, views)
@@ -202,14 +206,6 @@ class GanStage(lightning.LightningModule):
         with full_precision(self.device):
             return self.generator.latent_space(torch.randn(shape, device=self.device))
 
-    def _draw(self, scenes: DecodedScenes, views: SceneViews) -> tuple[Tensor, Tensor]:
-        """Maps of the scenes, and the number of objects of each class in each room."""
-        kept, classes = choices(scenes, self.model.completeness_target)
-        faces, mode = self.generator.faces, self.settings.silhouettes
-        assert faces is not None, "GanModel has meshes"
-        maps = rendered_maps(scenes, faces, views, kept, classes, mode)
-        return maps, (kept.unsqueeze(-1) * classes).sum(dim=1)
-
     def _update(self, optimizer: LightningOptimizer, loss: Tensor) -> None:
         optimizer.zero_grad()
         self.manual_backward(loss)
@@ -249,3 +245,41 @@ def spread_out(layout: LayoutDecoder, features: Float[Tensor, "rooms objects wid
         scale = spread / values.std()
         weight *= scale
         bias.copy_(mean + scale * (bias - values.mean()))
+
+
+def bounds_penalty(scenes: DecodedScenes, views: SceneViews) -> Float[Tensor, ""]:
+    """Mean distance in metres by which boxes exceed the room's bounds and sizes exceed `SIZES_M`.
+
+    In a map, a bed looks the same as a huge bed behind the room. Objects that no view shows get no
+    other gradient, so without this penalty they would not return to the room.
+    """
+    reach = camera_centers(views.world_to_camera).abs().amax(dim=(0, 1)) + MARGIN_M
+    reach[1] = CEILING_M / 2
+    aside = scenes.centers_m - reach.new_tensor([0, CEILING_M / 2, 0])
+    smallest, largest = SIZES_M
+    outside = (
+        F.relu(aside.abs() + scenes.sizes_m / 2 - reach),
+        F.relu(smallest - scenes.sizes_m),
+        F.relu(scenes.sizes_m - largest),
+    )
+    return torch.stack(outside).mean()
+
+
+def logit_penalty(scenes: DecodedScenes) -> Float[Tensor, ""]:
+    """Mean square of the completeness logits, plus that of the class logits except `void`."""
+    classes = scenes.class_logits[..., VOID + 1 :]
+    return classes.square().mean() + scenes.completeness_logits.square().mean()
+
+
+def diversity_loss(scenes: DecodedScenes) -> Float[Tensor, ""]:
+    """Minus the mean log of the standard deviation of the k-th object's position and size over
+    rooms, relative to `VARIED`.
+
+    Up to a constant, this is minus the entropy of normal distributions with these deviations (after
+    Kumar et al., "Maximum entropy generators for energy-based models", 2019). A deviation is at
+    least about 1 mm, and it is not rewarded beyond `VARIED`, because that would drive objects out
+    of the room.
+    """
+    boxes = torch.cat([scenes.centers_m[..., [0, 2]], scenes.sizes_m], dim=-1)
+    wanted = boxes.new_tensor(VARIED).square()
+    return -((boxes.var(dim=0, correction=0) + 1e-6) / wanted).clamp(max=1).log().mean() / 2

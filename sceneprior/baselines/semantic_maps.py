@@ -1,22 +1,35 @@
-"""Semantic maps: the share of each class per pixel, of observed views and of decoded scenes."""
+"""Semantic maps, the share of each class per pixel: of observed views, of generated scenes, and the
+discriminator that compares them."""
+
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
+from torch.nn.utils.parametrizations import spectral_norm
 
 from sceneprior.core.cameras import project
 from sceneprior.core.classes import VOID
+from sceneprior.core.errors import InputError
 from sceneprior.core.views import DecodedScenes, SceneViews
+from sceneprior.paper.decoders import mlp
 from sceneprior.render.silhouettes.render import render_scene
 
 POOLING = 2
 """Side of a map's pixel, in pixels of the instance ids. Pooling softens the hard edges of real
 maps, which would otherwise distinguish them from rendered ones."""
-
 SIGMA_PX2 = 0.25
 """Softness of rendered edges, chosen to match pooled hard edges: coverage rises from 0.27 to 0.73
 between half a pixel outside and half a pixel inside."""
+SLOPE = 0.2
+"""Slope of the leaky ReLUs."""
+SMALLEST_PX = 4
+"""Minimum side of a map; halving it twice leaves one pixel."""
+GAIN = 10
+"""Factor on all scores, which spectral normalisation makes small."""
+AREA = 10
+"""Factor on the pixel shares in `contents`, because such a share is only a few hundredths."""
 
 
 def observed_maps(
@@ -37,7 +50,7 @@ def rendered_maps(
     views: SceneViews,
     kept: Float[Tensor, "rooms objects"],
     classes: Float[Tensor, "rooms objects classes"],
-    mode: str = "fast",
+    mode: str,
 ) -> Float[Tensor, "rooms views classes height width"]:
     """Maps of decoded scenes, one scene per room, rendered in the cameras of the views.
 
@@ -73,7 +86,7 @@ def observed_counts(views: SceneViews, classes: int) -> Float[Tensor, "rooms cla
 
 
 def choices(
-    scenes: DecodedScenes, completeness_target: str = "first_n"
+    scenes: DecodedScenes, completeness_target: str
 ) -> tuple[Float[Tensor, "rooms objects"], Float[Tensor, "rooms objects classes"]]:
     """Existence and one-hot class of each object, as `to_rooms` decides them.
 
@@ -88,7 +101,7 @@ def choices(
 
 
 def kept_share(
-    scores: Float[Tensor, "rooms slots"], convention: str = "first_n"
+    scores: Float[Tensor, "rooms slots"], convention: str
 ) -> Float[Tensor, "rooms slots"]:
     """Probability that each prediction belongs to the scene, if completeness scores are independent
     probabilities.
@@ -127,3 +140,63 @@ def compose_maps(
     maps = torch.einsum("rvkhw,rkc->rvchw", visible, classes)
     maps[:, :, VOID] += left[:, :, -1]
     return maps
+
+
+class MapDiscriminator(nn.Module):
+    """Scores each patch of 18 x 18 pixels of a map, and each room by all of its views.
+
+    Every layer is spectrally normalised, so that the network is about 1-Lipschitz. There is no
+    depth channel (supplement, Baselines). Two layers halve the sides; the first has `width`
+    channels, the second twice as many.
+    """
+
+    def __init__(self, classes: int, width: int = 32):
+        super().__init__()
+        self.layers = _bounded(
+            nn.Conv2d(classes, width, 4, stride=2, padding=1),
+            nn.Conv2d(width, 2 * width, 4, stride=2, padding=1),
+        )
+        self.patch = _bounded(nn.Conv2d(2 * width, 1, 3, padding=1))
+        self.room = _bounded(nn.Linear(4 * width, 2 * width), nn.Linear(2 * width, 1))
+
+    def forward(
+        self, maps: Float[Tensor, "rooms views classes height width"]
+    ) -> tuple[Float[Tensor, "rooms views rows columns"], Float[Tensor, " rooms"]]:
+        """Scores of patches and of rooms; higher means more real.
+
+        A room's features are the mean and the maximum over its views, so the order and number of
+        views do not matter.
+        """
+        height, width = maps.shape[-2:]
+        if min(height, width) < SMALLEST_PX:
+            raise InputError(
+                f"Semantic maps of {height} x {width} pixels are too small for the GAN, which "
+                f"needs {SMALLEST_PX} x {SMALLEST_PX}; lower data.mask_step, or prepare larger "
+                "images."
+            )
+        x = F.leaky_relu(self.layers(maps.flatten(0, 1)), SLOPE)
+        patches = self.patch(x)[:, 0].unflatten(0, maps.shape[:2])
+        features = x.mean(dim=(2, 3)).unflatten(0, maps.shape[:2])
+        room = torch.cat([features.mean(dim=1), features.amax(dim=1)], dim=-1)
+        return GAIN * patches, GAIN * self.room(room)[:, 0]
+
+
+def _bounded(*layers: nn.Module) -> nn.Sequential:
+    return mlp(*(spectral_norm(layer) for layer in layers), slope=SLOPE)
+
+
+def adversarial_loss(scores: Sequence[Tensor], real: bool) -> Float[Tensor, ""]:
+    """Cross entropy of scores as logits of being real, summed over patches and rooms.
+
+    The generator minimises it with `real` true for its own maps: the non-saturating loss of
+    Goodfellow et al., "Generative adversarial nets", NeurIPS 2014.
+    """
+    return torch.stack([F.softplus(-score if real else score).mean() for score in scores]).sum()
+
+
+def contents(
+    maps: Float[Tensor, "rooms views classes height width"], counts: Float[Tensor, "rooms classes"]
+) -> Float[Tensor, "rooms both"]:
+    """For each class, the number of objects in a room, and `AREA` times the class's share of the
+    pixels of all views."""
+    return torch.cat([counts, AREA * maps.mean(dim=(1, 3, 4))], dim=-1)

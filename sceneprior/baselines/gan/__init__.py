@@ -1,1 +1,0 @@
-"""A GAN on semantic maps, in place of the view loss."""
