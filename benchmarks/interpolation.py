@@ -30,7 +30,11 @@ import sceneprior
 from sceneprior.core.ground_truth import known_in_3d
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.core.surfaces import chamfer_of, surface_points
-from sceneprior.evaluation.metrics.overlaps import plausible_pairs, room_overlaps
+from sceneprior.evaluation.metrics.contents import (
+    intersecting,
+    plausible_pairs,
+    sum_over_pairs,
+)
 from sceneprior.paper.interpolate import RoomPath, even_places
 from sceneprior.paper.prior import TrainedPrior
 from sceneprior.paper.sampling import DecodedRoom, decode_rooms, draw_latents
@@ -189,8 +193,8 @@ def apart_m(a: Mesh, b: Mesh) -> np.ndarray:
 
 def judged(rooms: Sequence[Scene], real: Sequence[Scene], test: Sequence[Scene]) -> dict[str, Any]:
     """Metrics of a set of rooms (docs/evaluation.md), without intervals."""
-    plausible, pairs = plausible_pairs(real), map(room_overlaps, rooms)
-    implausible = [(each.intersect & ~plausible[tuple(each.classes.T)]).sum() for each in pairs]
+    plausible = plausible_pairs(real)
+    implausible = [sum_over_pairs(room, ~plausible, intersecting) for room in rooms]
     return {
         "implausible_pairs": float(np.mean(implausible)),
         "relations_m": relations(rooms, real, test),

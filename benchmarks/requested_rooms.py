@@ -36,7 +36,7 @@ from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.shards import iterate_rooms
 from sceneprior.evaluation.metric import Comparison, RoomSet
-from sceneprior.evaluation.metrics.layout_classifier import layout_classifier_accuracy
+from sceneprior.evaluation.metrics.layouts import layout_classifier_accuracy
 from sceneprior.lifted.requests.floors import Floor, RoomShape
 from sceneprior.lifted.requests.relations import OUTWARD, Furniture, RelationChecks
 from sceneprior.lifted.requests.wishes import TO_ROOM, TO_TARGET, RelationWish

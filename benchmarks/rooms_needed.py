@@ -35,7 +35,7 @@ from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.scene import Scene
 from sceneprior.core.shards import iterate_rooms
 from sceneprior.evaluation.metric import Comparison, RoomSet
-from sceneprior.evaluation.metrics.relations import relation_distance
+from sceneprior.evaluation.metrics.layouts import relation_distance
 from sceneprior.paper.sampling import decode_training_rooms
 
 TRAIN_SHARE = 0.7

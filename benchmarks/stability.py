@@ -14,7 +14,7 @@ import numpy as np
 from sceneprior.apps.api import load
 from sceneprior.core.contact_resolution import make_stable
 from sceneprior.core.scene import Scene
-from sceneprior.evaluation.metrics.stability import Settled, settle
+from sceneprior.evaluation.metrics.physics import Settled, settle
 from sceneprior.render.scene_files import load_scene_folder
 
 

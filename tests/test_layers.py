@@ -90,7 +90,7 @@ OWNERS = {
     ],
     "cv2": ["data_prep/readers/posed/cameras.py", "sceneprior/evaluation/metrics/"],
     "viser": ["sceneprior/apps/viewer/"],
-    "mujoco": ["sceneprior/evaluation/metrics/stability.py"],
+    "mujoco": ["sceneprior/evaluation/metrics/physics.py"],
     "coacd": ["sceneprior/core/colliders.py"],
 }  # fmt: skip
 

@@ -9,8 +9,7 @@ import torch
 from sceneprior.core.classes import label_set
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.evaluation.metric import Comparison, RoomSet, resample_counts
-from sceneprior.evaluation.metrics import layout_classifier, picture_classifiers
-from sceneprior.evaluation.metrics.novelty import nearest_known
+from sceneprior.evaluation.metrics import layouts, picture_classifiers
 
 UNIT = (1.0, 1.0, 1.0)
 
@@ -43,15 +42,9 @@ def of_classes(*labels: str) -> Scene:
     return room(*((label, (3.0 * index, 0.5, 0.0)) for index, label in enumerate(labels)))
 
 
-def room_set(
-    scenes: Sequence[Scene],
-    training: Sequence[Scene],
-    decoded: Sequence[Scene] = (),
-    own: bool = False,
-) -> RoomSet:
-    """A set without pictures; `own`: the scenes are training rooms."""
-    nearest = nearest_known(scenes, training, decoded, own)
-    return RoomSet(scenes, {}, None, nearest, resample_counts(len(scenes), 20, 0))
+def room_set(scenes: Sequence[Scene]) -> RoomSet:
+    """A set without pictures."""
+    return RoomSet(scenes, {}, resample_counts(len(scenes), 20, 0))
 
 
 def without_classifiers(patch: pytest.MonkeyPatch) -> None:
@@ -62,12 +55,13 @@ def without_classifiers(patch: pytest.MonkeyPatch) -> None:
         return np.ones(len(others), dtype=int)
 
     patch.setattr(picture_classifiers, "linear", answer_one)
-    patch.setattr(layout_classifier, "boosted_trees", answer_one)
+    patch.setattr(layouts, "boosted_trees", answer_one)
 
 
 def compared_with(test: RoomSet, **known) -> Comparison:
     """A comparison with these test rooms; `known` is what the metric under test needs."""
     classes = len(label_set("front3d_bedroom"))
     plausible = np.zeros((classes, classes), dtype=bool)
-    given = {"plausible_pairs": plausible, "near_copy_m": 0.0, "real": []} | known
+    given = {"train": [], "val": [], "decoded": []} | known
+    given = {"plausible_pairs": plausible, "near_copy_m": 0.0} | given
     return Comparison(test=test, seed=0, alexnet=None, **given)

@@ -4,12 +4,11 @@ intervals."""
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Real, Shaped
 
-from sceneprior.core.classes import VOID
 from sceneprior.core.scene import Scene
 from sceneprior.evaluation.features import Features
 
@@ -23,23 +22,28 @@ METHOD = (
 
 def resample_counts(
     rooms: int, resamples: int, seed: int | tuple[int, ...]
-) -> Int[np.ndarray, "resamples rooms"]:
-    """Count how often each room occurs in each resample of `rooms` drawn with replacement."""
+) -> Int[np.ndarray, "sets rooms"]:
+    """Count how often each room occurs in the set itself (row 0: once), and in each resample of
+    `rooms` drawn with replacement."""
     shares = np.full(rooms, 1 / rooms)
-    return np.random.default_rng(seed).multinomial(rooms, shares, size=resamples)
+    drawn = np.random.default_rng(seed).multinomial(rooms, shares, size=resamples)
+    return np.insert(drawn, 0, 1, axis=0)
 
 
 @dataclass(frozen=True)
 class Estimate:
     """A metric's value on the rooms and on every resample of them."""
 
-    value: float | None
-    """Value on the rooms themselves; None if the metric is undefined for this set."""
-    resamples: Float[np.ndarray, " resamples"]
-    """Values on the resamples; those on which the metric is undefined are left out."""
+    values: Float[np.ndarray, " sets"]
+    """Values on the rooms themselves (first) and on each resample; NaN if undefined."""
     low: float = -np.inf
     high: float = np.inf
     """Bounds of the metric by definition; the interval is clipped to [low, high]."""
+
+    @property
+    def value(self) -> float | None:
+        """Value on the rooms themselves; None if the metric is undefined for this set."""
+        return float(self.values[0]) if np.isfinite(self.values[0]) else None
 
     def interval(self) -> list[float] | None:
         """Lower and upper end of the interval; None if there is no value or there are no resamples.
@@ -48,11 +52,11 @@ class Estimate:
         apart: the resamples of a Frechet distance all lie above the distance itself. This bias is
         removed: the quantiles are shifted so that the mean of the resamples equals the value.
         """
-        if self.value is None or len(self.resamples) == 0:
+        known = self.values[np.isfinite(self.values)][1:]
+        if self.value is None or len(known) == 0:
             return None
         tail = (1 - COVERAGE) / 2
-        spread = np.quantile(self.resamples, [tail, 1 - tail])
-        ends = self.value + spread - self.resamples.mean()
+        ends = self.value + np.quantile(known, [tail, 1 - tail]) - known.mean()
         return [float(end) for end in np.clip(ends, self.low, self.high)]
 
     def combined(
@@ -62,38 +66,29 @@ class Estimate:
         low: float = -np.inf,
         high: float = np.inf,
     ) -> "Estimate":
-        """A function of this metric and another, on the rooms and on each resample that both have;
-        undefined if either metric is, and left out where the function is not finite."""
-        if self.value is None or other.value is None:
-            return Estimate(None, np.zeros(0))
-        both = min(len(self.resamples), len(other.resamples))
+        """A function of this metric and another, on the rooms and on each resample; undefined where
+        either metric is, or the function is not finite."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            value = function(np.float64(self.value), np.float64(other.value))
-            resamples = function(self.resamples[:both], other.resamples[:both])
-        if not np.isfinite(value):
-            return Estimate(None, np.zeros(0))
-        return Estimate(float(value), resamples[np.isfinite(resamples)], low, high)
+            return Estimate(function(self.values, other.values), low, high)
 
 
 def ratio(
     numerators: Real[np.ndarray, " rooms"],
     denominators: Real[np.ndarray, " rooms"],
-    counts: Int[np.ndarray, "resamples rooms"],
+    counts: Int[np.ndarray, "sets rooms"],
     high: float = np.inf,
 ) -> Estimate:
     """The ratio of two sums over rooms, from 0 to `high`, such as a mean over rooms or objects.
 
-    A denominator of 0 leaves its room out. If all are 0, the value is None.
+    A denominator of 0 leaves its room out. If all are 0, the ratio is undefined.
     """
-    total = denominators.sum()
-    value = float(numerators.sum() / total) if total > 0 else None
-    over = counts @ denominators
-    return Estimate(value, (counts @ numerators)[over > 0] / over[over > 0], 0.0, high)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return Estimate((counts @ numerators) / (counts @ denominators), 0.0, high)
 
 
 def mean_of_rooms(
     values: Sequence[float | int | None] | Shaped[np.ndarray, " rooms"],
-    counts: Int[np.ndarray, "resamples rooms"],
+    counts: Int[np.ndarray, "sets rooms"],
     high: float = np.inf,
 ) -> Estimate:
     """The mean over rooms of non-negative values; rooms with None are left out."""
@@ -129,49 +124,17 @@ Counts = Mapping[str, tuple[float | int, float | int]]
 ratio of their sums over rooms; a room with denominator 0 is left out."""
 
 
-class Nearest(NamedTuple):
-    """Layout distances of rooms to training rooms, true and decoded, in metres."""
-
-    training_m: Float[np.ndarray, " rooms"]
-    """Distance to the nearest true training room."""
-    decoded_m: Float[np.ndarray, " rooms"] | None
-    """Distance to the nearest training room as the prior decodes it; None if it decodes none."""
-    as_copies_m: Float[np.ndarray, " rooms"]
-    """Distance to the nearest true or decoded room by `nearest_distances(as_copies=True)`; inf if
-    none of these rooms holds the same furniture."""
-
-    def of(self, rows: Sequence[int]) -> "Nearest":
-        """The distances of the rooms `rows`."""
-        picked = [None if part is None else part[list(rows)] for part in self]
-        return Nearest(*picked)  # type: ignore[arg-type]
-
-
 @dataclass(frozen=True)
 class RoomSet:
-    """A set of rooms with the features, distances and resamples that metrics read."""
+    """A set of rooms with the features and resamples that metrics read."""
 
     scenes: Sequence[Scene]
     pictures: Features
-    """Features of the rooms' pictures, objects drawn with their meshes if they have any; empty if
-    no metric reads them."""
-    box_pictures: Features | None
-    """Features of pictures in which every object is drawn as its box; None without `--boxes`."""
-    nearest: Nearest
-    """Layout distances of each room to training rooms other than itself."""
-    counts: Int[np.ndarray, "resamples rooms"]
-    """Multiplicity of each room in each bootstrap resample."""
-
-    def features(self, network: str, boxes: bool = False) -> np.ndarray:
-        """A network's features of the rooms' pictures, or of the pictures with boxes. Under
-        `small`, which the AlexNet classifier reads, these are the pictures themselves."""
-        pictures = self.box_pictures if boxes else self.pictures
-        assert pictures is not None  # metrics of boxes are computed only with `--boxes`
-        return pictures[network]
-
-
-def object_count(scene: Scene) -> int:
-    """Number of objects in a scene, void left out."""
-    return int((scene.class_indices != VOID).sum())
+    """Features of the rooms' pictures, objects drawn with their meshes if they have any, and with
+    the suffix `_boxes` those of pictures in which every object is drawn as its box; empty if no
+    metric reads them."""
+    counts: Int[np.ndarray, "sets rooms"]
+    """Multiplicity of each room: 1 in row 0, then in each bootstrap resample."""
 
 
 def emptiness(scenes: Sequence[Scene]) -> str | None:
@@ -180,7 +143,7 @@ def emptiness(scenes: Sequence[Scene]) -> str | None:
     Metrics of empty rooms mislead: no objects intersect, and a blank picture easily lies in the
     ball around a real room's picture, which raises precision.
     """
-    empty = sum(object_count(scene) == 0 for scene in scenes)
+    empty = sum(not scene.objects for scene in scenes)
     if 2 * empty <= len(scenes):
         return None
     return (
@@ -208,9 +171,12 @@ class Comparison:
     """The rooms and settings that a set of rooms is compared with."""
 
     test: RoomSet
-    real: Sequence[Scene]
-    """All real rooms that a classifier may train on: the training rooms and, if the split is
-    `test`, the val rooms. The set `train_rooms` holds the same `Scene` objects."""
+    train: Sequence[Scene]
+    """All training rooms. The set `train_rooms` holds the same `Scene` objects."""
+    val: Sequence[Scene]
+    """The val rooms, on which classifiers may train too; empty if `test` holds the val split."""
+    decoded: Sequence[Scene]
+    """Training rooms as the prior decodes them, if it does, named like the true ones."""
     seed: int
     """Seed of the classifiers' folds."""
     alexnet: Path | None
@@ -220,6 +186,10 @@ class Comparison:
     """Distance to a training room with the same furniture below which a room is a near copy."""
     columns: dict[str, dict[str, Estimate]] = field(default_factory=dict)
     """Estimates computed so far, by set and key; generated rooms come last."""
+
+    def trained_on(self, rooms: RoomSet) -> bool:
+        """True if the rooms are training rooms themselves."""
+        return any(rooms.scenes[0] is other for other in self.train)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ import base64
 import io
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -89,30 +89,17 @@ def data_uri(kind: str, content: bytes) -> str:
     return f"data:{kind};base64,{base64.b64encode(content).decode()}"
 
 
-_POINTS_PER_CURVE = 400
-_EMPTY = (244, 245, 247)
-
-
-@dataclass(frozen=True)
-class RoomPictures:
-    """The pictures and the 3D model of one scene on the page."""
-
-    name: str
-    contents: str
-    """The scene's objects in words: "double bed, nightstand ×2"."""
-    topdown: str
-    """Data URI of the plan from straight above, at half size and the same scale for all rooms."""
-    perspective: str
-    """Data URI of the shaded view from above a corner."""
-    glb: str
-    """Data URI of the 3D model that replaces the shaded view; empty if none was requested."""
-
-
-def room_pictures(scene: Scene, most_faces: int = 0, shell: ShellName = "none") -> RoomPictures:
+def room_pictures(scene: Scene, most_faces: int = 0, shell: ShellName = "none") -> dict[str, str]:
     """Draw a scene's plan and corner view, and export its 3D model.
 
     View and model have walls if `shell` is `walls`, or the room has doors or windows. `most_faces`
     limits the faces of each object's mesh; 0 leaves the model out.
+
+    Returns:
+        `name`; `contents`, the objects in words ("double bed, nightstand ×2"); and data URIs:
+        `topdown`, the plan from straight above, at half size and the same scale for all rooms;
+        `perspective`, the shaded view from above a corner; `glb`, the 3D model that replaces this
+        view, or an empty text.
     """
     counts = Counter(item.label.replace("_", " ") for item in scene.objects)
     words = [name if many == 1 else f"{name} ×{many}" for name, many in sorted(counts.items())]
@@ -121,10 +108,14 @@ def room_pictures(scene: Scene, most_faces: int = 0, shell: ShellName = "none") 
     solid = io.BytesIO()
     shaded = Image.fromarray(perspective(scene, view=view_of(scene, (330, 440), shell)))
     shaded.save(solid, format="JPEG", quality=86, optimize=True)
-    solid_uri = data_uri("image/jpeg", solid.getvalue())
     glb = data_uri("model/gltf-binary", glb_of(scene, most_faces, shell)) if most_faces else ""
-    contents = ", ".join(words) or "nothing"
-    return RoomPictures(scene.name, contents, png_uri(flat.quantize(64)), solid_uri, glb)
+    return {
+        "name": scene.name,
+        "contents": ", ".join(words) or "nothing",
+        "topdown": png_uri(flat.quantize(64)),
+        "perspective": data_uri("image/jpeg", solid.getvalue()),
+        "glb": glb,
+    }
 
 
 def legend(scenes: Sequence[Scene]) -> list[tuple[str, str]]:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -37,8 +37,6 @@ from sceneprior.render.appearance import paint_ids, quiet_colors
 ROOMS_SHOWN = 8
 DECODED_SHOWN = 5
 UNFOLDING_SHOWN = 9
-
-_T = TypeVar("_T")
 
 
 def write_report(
@@ -77,10 +75,11 @@ def write_report(
     test = reference_scenes(shards, "test", limit=ROOMS_SHOWN) if known else []
     with Shard(list_shards(shards, "train")[0]) as first:
         names = first.label_set
-    along = _spread(unfolding, UNFOLDING_SHOWN)
+    steps = np.linspace(0, len(unfolding) - 1, min(UNFOLDING_SHOWN, len(unfolding)))
+    along = [unfolding[row] for row in steps.round().astype(int)]
     pairs = list(decoded)[:DECODED_SHOWN]
-    shown = [*generated, *test, *along, *(scene for pair in pairs for scene in pair)]
-    most_faces = faces_per_object([*generated, *test, *(scene for pair in pairs for scene in pair)])
+    in_3d = [*generated, *test, *(scene for pair in pairs for scene in pair)]
+    most_faces = faces_per_object(in_3d)
     page = render(
         "report.html.jinja",
         title=title,
@@ -95,7 +94,7 @@ def write_report(
         generated=[room_pictures(scene, most_faces) for scene in generated],
         test=[room_pictures(scene, most_faces) for scene in test],
         unfolding=[room_pictures(scene) for scene in along],
-        legend=legend(shown),
+        legend=legend([*in_3d, *along]),
         headings=headings(scores),
         rows=score_rows(scores),
         relation_headings=RELATION_HEADINGS,
@@ -107,20 +106,13 @@ def write_report(
     write_whole(path, page)
 
 
-def _spread(items: Sequence[_T], count: int) -> list[_T]:
-    """At most `count` items, evenly spaced, with the first and the last."""
-    rows = np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)
-    return [items[row] for row in rows]
-
-
 def _pair(decoded: Scene, truth: Scene, most_faces: int) -> dict[str, Any]:
     match = match_scenes(decoded, truth)
     accuracy, iou = match.class_accuracy, match.mean_iou
-    summary = (
-        "an empty room"
-        if accuracy is None or iou is None
-        else f"{percent(accuracy)} of {match.truth_count} classes right, mean 3D box IoU {iou:.2f}"
-    )
+    summary = "an empty room"
+    if accuracy is not None and iou is not None:
+        right = f"{percent(accuracy)} of {match.truth_count} classes right"
+        summary = f"{right}, mean 3D box IoU {iou:.2f}"
     # Both scenes get the true floor, so that both pictures are framed alike.
     rooms = {"decoded": replace(decoded, floor_m=truth.floor_m), "truth": truth}
     pictures = {name: room_pictures(scene, most_faces) for name, scene in rooms.items()}

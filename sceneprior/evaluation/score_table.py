@@ -24,27 +24,44 @@ COLUMNS = {
 such a count has no column."""
 
 
+RELATION_HEADINGS = (
+    "an object", "and the nearest", "distance of gaps, m", "real training, m",
+    "within 0.3 m", "real test",
+)  # fmt: skip
+
+
 def score_rows(scores: dict[str, Any]) -> list[tuple[str, ...]]:
     """The table of a result: (title, unit, one cell per column of `headings`).
 
     A cell holds the value and, on a second line, its interval; a missing value is a dash. A metric
     that the result lacks has no row.
     """
+    columns = []
+    for name in _sets(scores):
+        suffix = "_test" if name == "test" else ""
+        values = scores if name in ("generated", "test") else scores.get(name, {})
+        columns.append((values, suffix, scores.get("intervals", {}).get(name, {})))
     return [
         (
             metric.title,
             metric.subtitle,
-            *(_cell(scores, name, metric.key) for name in _sets(scores)),
+            *(
+                _cell(values.get(metric.key + suffix), intervals.get(metric.key))
+                for values, suffix, intervals in columns
+            ),
         )
         for metric in (*METRICS, *USE)
         if metric.key in scores
     ]
 
 
-RELATION_HEADINGS = (
-    "an object", "and the nearest", "distance of gaps, m", "real training, m",
-    "within 0.3 m", "real test",
-)  # fmt: skip
+def _cell(value: float | None, interval: list[float] | None) -> str:
+    if value is None:
+        return "–"
+    digits = 3 if abs(value) < 10 else 1
+    if interval is None or value == interval[0] == interval[1]:
+        return f"{value:.{digits}f}"
+    return f"{value:.{digits}f}\n{interval[0]:.{digits}f} to {interval[1]:.{digits}f}"
 
 
 def relation_rows(scores: dict[str, Any]) -> list[tuple[str, ...]]:
@@ -70,19 +87,6 @@ def _sets(scores: dict[str, Any]) -> list[str]:
     return [name for name in COLUMNS if f"n_{name}" in scores.get("protocol", {})]
 
 
-def _cell(scores: dict[str, Any], column: str, key: str) -> str:
-    places = {"generated": (scores, key), "test": (scores, f"{key}_test")}
-    where, name = places.get(column) or (scores.get(column, {}), key)
-    value = where.get(name)
-    interval = scores.get("intervals", {}).get(column, {}).get(key)
-    if value is None:
-        return "–"
-    digits = 3 if abs(value) < 10 else 1
-    if interval is None or value == interval[0] == interval[1]:
-        return f"{value:.{digits}f}"
-    return f"{value:.{digits}f}\n{interval[0]:.{digits}f} to {interval[1]:.{digits}f}"
-
-
 def wide_console() -> Console:
     """A console on stdout, at least `WIDTH` wide for a file or a pipe, where rich assumes 80."""
     console = Console()
@@ -95,16 +99,19 @@ def print_scores(scores: dict[str, Any], console: Console | None = None) -> None
     """Print the table of a result, and the protocol's main entries below it."""
     console = console or wide_console()
     split = scores.get("protocol", {}).get("split")
-    table = Table(
-        title="Rooms for use" if split is None else f"Synthesis against {split} rooms",
-        box=box.SIMPLE_HEAD,
-        caption=_caption(scores),
-    )
+    title = "Rooms for use" if split is None else f"Synthesis against {split} rooms"
+    table = Table(title=title, box=box.SIMPLE_HEAD, caption=_caption(scores))
     table.add_column("", overflow="fold")
     for heading, rooms in headings(scores):
         table.add_column(f"{heading}\n{rooms}", justify="right")
     for title, unit, *cells in score_rows(scores):
-        table.add_row(*(_dim_below_first(text) for text in (f"{title}\n{unit}", *cells)))
+        lines = (text.split("\n") for text in (f"{title}\n{unit}", *cells))
+        table.add_row(
+            *(
+                Text.assemble(first, *((f"\n{line}", "dim") for line in below))
+                for first, *below in lines
+            )
+        )
     console.print(table)
     if rows := relation_rows(scores):
         pairs = Table(
@@ -114,11 +121,6 @@ def print_scores(scores: dict[str, Any], console: Console | None = None) -> None
         for row in rows:
             pairs.add_row(*row)
         console.print(pairs)
-
-
-def _dim_below_first(cell: str) -> Text:
-    first, *below = cell.split("\n")
-    return Text.assemble(first, *((f"\n{line}", "dim") for line in below))
 
 
 def _caption(scores: dict[str, Any]) -> str:

@@ -1,15 +1,26 @@
 """Evaluate generated rooms against the test rooms of shards, with real and random baselines."""
 
 import hashlib
-from collections.abc import Container, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from importlib.metadata import distributions, version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+
 from sceneprior.core.errors import InputError
+from sceneprior.core.ground_truth import (
+    independent_rooms,
+    known_in_3d,
+    reference_scenes,
+    shuffled_rooms,
+    stream_scenes,
+)
 from sceneprior.core.scene import Scene
-from sceneprior.evaluation.features import Drawing, check_inception, file_digest
+from sceneprior.evaluation.features import Drawing, Features, check_inception, file_digest
 from sceneprior.evaluation.metric import (
     METHOD,
     PICTURED,
@@ -18,15 +29,18 @@ from sceneprior.evaluation.metric import (
     Estimate,
     RoomSet,
     emptiness,
+    resample_counts,
 )
 from sceneprior.evaluation.metrics import METRICS
-from sceneprior.evaluation.metrics.contents import TYPE_CLASSES, common_label_set
-from sceneprior.evaluation.metrics.layout_classifier import FEW_TEST_ROOMS
+from sceneprior.evaluation.metrics.contents import (
+    TYPE_CLASSES,
+    common_label_set,
+    plausible_pairs,
+    without_void,
+)
+from sceneprior.evaluation.metrics.layouts import FEW_TEST_ROOMS, furthest_pairs
 from sceneprior.evaluation.metrics.novelty import near_copy_threshold
-from sceneprior.evaluation.metrics.overlaps import plausible_pairs
-from sceneprior.evaluation.metrics.picture_classifiers import ALEXNET, check_alexnet
-from sceneprior.evaluation.metrics.relations import furthest_pairs
-from sceneprior.evaluation.room_sets import choose_rooms, draw_rooms, room_sets
+from sceneprior.evaluation.metrics.picture_classifiers import ALEXNET, alexnet_weights
 
 FORMAT = "sceneprior-scores"
 VERSION = 4
@@ -99,107 +113,200 @@ def evaluate_synthesis(
     if options.inception is not None:
         check_inception(options.inception)
     if options.alexnet is not None:
-        check_alexnet(options.alexnet)
-    rooms = choose_rooms(generated, shards, options.split, options.seed, decoded)
+        alexnet_weights(options.alexnet)
+    rooms = _choose_rooms(generated, shards, options, decoded)
     names = common_label_set(rooms.groups["test"])
     drawing = Drawing(names, options.inception, small=options.alexnet is not None)
-    drawn, as_boxes = draw_rooms(rooms, shards, drawing, options.boxes)
-    sets = room_sets(rooms, drawn, as_boxes, options.resamples)
+    drawn = _draw_rooms(rooms, shards, drawing, options)
+    sets = _room_sets(rooms, drawn, options)
     comparison = Comparison(
         test=sets["test"],
-        real=[*rooms.every_train, *rooms.val],
+        train=rooms.train,
+        val=rooms.val,
+        decoded=decoded,
         seed=options.seed,
         alexnet=options.alexnet,
-        plausible_pairs=plausible_pairs(rooms.every_train),
-        near_copy_m=near_copy_threshold(rooms.every_train),
+        plausible_pairs=plausible_pairs(rooms.train),
+        near_copy_m=near_copy_threshold(rooms.train),
     )
-    columns = _evaluate(sets, comparison, options)
-    protocol = {
-        "label_set": names,
-        "shards": Path(shards).resolve().name,
-        "split": options.split,
-        **{f"n_{group}": len(scenes) for group, scenes in rooms.groups.items() if group != "train"},
-        "n_train_rooms": len(rooms.train_rows),
-        "n_train_rooms_available": len(rooms.every_train),
-        "n_real": len(comparison.real),
-        "n_pictured": len(rooms.pictured_rows),
-        "near_copy_m": comparison.near_copy_m,
-        "seed": options.seed,
-        "resamples": options.resamples,
-        "intervals": METHOD,
-        "render": drawing.protocol,
-        # Digest of the concatenated digests of the pictures, in the order of the rooms.
-        "renders_sha256": {
-            group: hashlib.sha256(features["picture_sha256"].tobytes()).hexdigest()
-            for group, features in drawn.items()
-        },
-        "networks": drawing.networks,
-        **_definitions(names, options.alexnet),
-        "left_out": _left_out(columns["generated"], options),
-        "packages": _package_versions(),
-    }
-    notes = (emptiness(rooms.groups["generated"]), _uncertainty(columns, len(sets["test"].scenes)))
-    return result_of(columns) | {
-        "relations": furthest_pairs(sets["generated"], sets["train"], comparison),
-        "note": " ".join([*filter(None, notes), NOTE]),
-        "protocol": protocol,
-    }
-
-
-def _definitions(names: str, alexnet: Path | None) -> dict[str, Any]:
-    """The protocol entries of all metrics, whether or not they could be computed."""
-    stated: dict[str, Any] = {} if alexnet is None else {"sca": {**ALEXNET, **file_digest(alexnet)}}
-    for metric in METRICS:
-        stated |= metric.protocol
-    return stated | {
-        "independent": "objects of training rooms put together at random (independent_rooms), as "
-        "many rooms as real training rooms; drawn as boxes, _meshes: with the real meshes",
-        "type_share": list(TYPE_CLASSES.get(names, ())),
-    }
-
-
-def _uncertainty(columns: dict[str, dict[str, Estimate]], test_rooms: int) -> str | None:
-    """A sentence on the layout classifier's interval, if there are few test rooms."""
-    interval = columns["generated"]["layout_classifier_accuracy"].interval()
-    if interval is None or test_rooms >= FEW_TEST_ROOMS:
-        return None
-    return (
-        f"With {test_rooms} test rooms, the accuracy of the layout classifier is uncertain: "
-        f"{interval[0]:.2f} to {interval[1]:.2f}."
-    )
-
-
-def _evaluate(
-    sets: dict[str, RoomSet], comparison: Comparison, options: EvalOptions
-) -> dict[str, dict[str, Estimate]]:
-    """Compute every metric whose options are given, by set of rooms and key."""
-    networks = _networks(options)
-    metrics = [metric for metric in METRICS if metric.lacks(networks, options.boxes) is None]
+    given = {"inception": options.inception, "alexnet": options.alexnet, "effnet_lite0": "a wheel"}
+    networks = [name for name, source in given.items() if source is not None]
+    lacks = {metric.key: metric.lacks(networks, options.boxes) for metric in METRICS}
+    columns = comparison.columns
     for name in ("test", *PICTURED):
         if name not in sets:
             continue
-        found = {}
-        for metric in metrics:
-            if name in metric.sets:
+        columns[name] = {}
+        for metric in METRICS:
+            if lacks[metric.key] is None and name in metric.sets:
                 pictured = name == "generated" and metric.network is not None
-                rooms = sets["pictured" if pictured else name]
-                found[metric.key] = metric.function(rooms, comparison)
-        comparison.columns[name] = {key: value for key, value in found.items() if value is not None}
-    return comparison.columns
-
-
-def _networks(options: EvalOptions) -> list[str]:
-    given = {"inception": options.inception, "alexnet": options.alexnet, "effnet_lite0": "a wheel"}
-    return [name for name, source in given.items() if source is not None]
-
-
-def _left_out(measured: Container[str], options: EvalOptions) -> dict[str, str]:
-    """The metrics of generated rooms that a result lacks, each with the option it needs."""
-    return {
-        metric.key: metric.lacks(_networks(options), options.boxes) or "decoded training rooms"
-        for metric in METRICS
-        if metric.key not in measured
+                estimate = metric.function(sets["pictured" if pictured else name], comparison)
+                if estimate is not None:
+                    columns[name][metric.key] = estimate
+    notes = [emptiness(rooms.groups["generated"])]
+    interval = columns["generated"]["layout_classifier_accuracy"].interval()
+    if interval is not None and len(sets["test"].scenes) < FEW_TEST_ROOMS:
+        notes.append(
+            f"With {len(sets['test'].scenes)} test rooms, the accuracy of the layout classifier is "
+            f"uncertain: {interval[0]:.2f} to {interval[1]:.2f}."
+        )
+    known = {name for name in _PACKAGES if any(True for _ in distributions(name=name))}
+    return result_of(columns) | {
+        "relations": furthest_pairs(sets["generated"], sets["train"], comparison),
+        "note": " ".join([*filter(None, notes), NOTE]),
+        "protocol": {
+            "label_set": names,
+            "shards": Path(shards).resolve().name,
+            "split": options.split,
+            **{f"n_{name}": len(each) for name, each in rooms.groups.items() if name != "train"},
+            "n_train_rooms": len(rooms.train_rows),
+            "n_train_rooms_available": len(rooms.train),
+            "n_real": len(rooms.train) + len(rooms.val),
+            "n_pictured": len(rooms.pictured_rows),
+            "near_copy_m": comparison.near_copy_m,
+            "seed": options.seed,
+            "resamples": options.resamples,
+            "intervals": METHOD,
+            "render": drawing.protocol,
+            # Digest of the concatenated digests of the pictures, in the order of the rooms.
+            "renders_sha256": {
+                group: hashlib.sha256(features["picture_sha256"].tobytes()).hexdigest()
+                for group, features in drawn.items()
+            },
+            "networks": drawing.networks,
+            **({"sca": ALEXNET | file_digest(options.alexnet)} if options.alexnet else {}),
+            **{key: entry for metric in METRICS for key, entry in metric.protocol.items()},
+            "independent": "objects of training rooms put together at random (independent_rooms), "
+            "as many rooms as real training rooms; drawn as boxes, _meshes: with the real meshes",
+            "type_share": list(TYPE_CLASSES.get(names, ())),
+            "left_out": {
+                key: option or "decoded training rooms"
+                for key, option in lacks.items()
+                if key not in columns["generated"]
+            },
+            "packages": {
+                name: version(name) if name in known else "not installed" for name in _PACKAGES
+            },
+        },
     }
+
+
+@dataclass(frozen=True)
+class _Rooms:
+    """The rooms to compare; only generated and decoded rooms keep their meshes."""
+
+    groups: dict[str, Sequence[Scene]]
+    """`test`, `generated`, `train`, `independent`, `shuffled` and, if any, `decoded_rooms`."""
+    train: Sequence[Scene]
+    """All training rooms."""
+    val: Sequence[Scene]
+    """The val rooms; empty if `test` holds the val split."""
+    train_rows: Sequence[int]
+    """Indices into `train` of the rooms in the group `train`."""
+    pictured_rows: Sequence[int]
+    """Indices of the generated rooms that are drawn and compared by their pictures."""
+
+
+def _choose_rooms(
+    generated: Sequence[Scene], shards: Path, options: EvalOptions, decoded: Sequence[Scene]
+) -> _Rooms:
+    split, seed = options.split, options.seed
+    test = reference_scenes(shards, split, meshes=False)
+    train = reference_scenes(shards, "train", meshes=False)
+    generated = [without_void(scene) for scene in generated]
+    common_label_set(generated, test)
+    no_val = split == "val" or not known_in_3d(shards, "val")
+    val = [] if no_val else reference_scenes(shards, "val", meshes=False)
+    rows = seeded_rows(len(train), len(generated), seed)
+    groups: dict[str, Sequence[Scene]] = {
+        "test": test,
+        "generated": generated,
+        "train": [train[row] for row in rows],
+    }
+    for group, scenes in groups.items():
+        if len(scenes) < 2:
+            raise InputError(
+                f"Scoring needs at least 2 {group} rooms, but there are {len(scenes)}; synthesize "
+                "or prepare more."
+            )
+    groups["independent"] = independent_rooms(train, len(rows), seed)
+    groups["shuffled"] = shuffled_rooms(train, len(rows), seed)
+    if len(decoded) > 1:
+        chosen = seeded_rows(len(decoded), len(rows), seed)
+        groups["decoded_rooms"] = [decoded[row] for row in chosen]
+    pictured = seeded_rows(len(generated), len(rows), seed)
+    return _Rooms(groups, train, val, rows, pictured)
+
+
+def _draw_rooms(
+    rooms: _Rooms, shards: Path, drawing: Drawing, options: EvalOptions
+) -> dict[str, Features]:
+    """Features of every group's pictures (and of `independent_meshes`), and of boxes if asked for.
+
+    Frechet distances and recall depend on the number of pictures, so as many generated rooms are
+    drawn as there are real training rooms.
+    """
+    generated = rooms.groups["generated"]
+    groups = rooms.groups | {"generated": [generated[row] for row in rooms.pictured_rows]}
+    with Progress(console=Console(stderr=True)) as bars:
+
+        def draw(title: str, scenes: Iterable[Scene], count: int) -> Features:
+            bar = bars.add_task(f"Drawing {title} rooms", total=count)
+            return drawing.features(scenes, lambda done: bars.advance(bar, done))
+
+        def draw_real(split: str, rows: Sequence[int]) -> Features:
+            return draw(split, stream_scenes(shards, split, rows), len(rows))
+
+        test_rows = range(len(groups["test"]))
+        drawn = {
+            "test": draw_real(options.split, test_rows),
+            "train": draw_real("train", rooms.train_rows),
+        }
+        for group in sorted(set(groups) - set(drawn)):
+            drawn[group] = draw(group.replace("_", " "), groups[group], len(groups[group]))
+        # Rooms are read again with meshes, so that all training meshes are in memory only here.
+        count = len(rooms.train_rows)
+        furnished = independent_rooms(
+            reference_scenes(shards, "train"), count, options.seed, with_meshes=True
+        )
+        drawn["independent_meshes"] = draw("independent, furnished", furnished, count)
+        del furnished
+        for group in sorted(groups) if options.boxes else ():
+            as_boxes = drawn[group]
+            if group not in ("independent", "shuffled"):  # these are boxes already
+                plain = [scene.without_meshes() for scene in groups[group]]
+                as_boxes = draw(f"boxed {group}", plain, len(plain))
+            drawn[group] |= {f"{network}_boxes": rows for network, rows in as_boxes.items()}
+    return drawn
+
+
+def _room_sets(
+    rooms: _Rooms, drawn: dict[str, Features], options: EvalOptions
+) -> dict[str, RoomSet]:
+    """The sets of rooms by name, with `pictured`, the subset of generated rooms that is drawn."""
+
+    def counts(count: int, number: int) -> np.ndarray:
+        return resample_counts(count, options.resamples, (options.seed, number))
+
+    sets = {
+        group: RoomSet(scenes, drawn[group], counts(len(scenes), number))
+        for number, (group, scenes) in enumerate(rooms.groups.items())
+    }
+    generated, rows = sets["generated"], rooms.pictured_rows
+    pictured = [generated.scenes[row] for row in rows]
+    sets["pictured"] = RoomSet(pictured, drawn["generated"], counts(len(rows), len(sets)))
+    sets["generated"] = replace(generated, pictures={})
+    pictures = drawn["independent_meshes"]
+    sets["independent_meshes"] = replace(sets["independent"], pictures=pictures)
+    return sets | {"train_rooms": sets["train"]}
+
+
+def seeded_rows(available: int, count: int, seed: int) -> list[int]:
+    """At most `count` of `available` row indices, drawn without replacement, sorted."""
+    if available <= count:
+        return list(range(available))
+    chosen = np.random.default_rng(seed).choice(available, size=count, replace=False)
+    return sorted(chosen.tolist())
 
 
 def result_of(columns: dict[str, dict[str, Estimate]]) -> dict[str, Any]:
@@ -219,9 +326,3 @@ def result_of(columns: dict[str, dict[str, Estimate]]) -> dict[str, Any]:
             for name, estimates in columns.items()
         },
     }
-
-
-def _package_versions() -> dict[str, str]:
-    """The version of every package that a result depends on."""
-    known = {name for name in _PACKAGES if any(True for _ in distributions(name=name))}
-    return {name: version(name) if name in known else "not installed" for name in _PACKAGES}

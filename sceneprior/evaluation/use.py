@@ -1,7 +1,7 @@
 """Metrics of use, which test whether rooms suit simulation: collisions, support, free floor, doors,
 volumes, stability."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,11 +15,10 @@ from sceneprior.core.contact_resolution import make_stable
 from sceneprior.core.errors import InputError
 from sceneprior.core.ground_truth import independent_rooms, reference_scenes, shuffled_rooms
 from sceneprior.core.scene import Scene
-from sceneprior.evaluation.metric import METHOD, Counts, Estimate, Metric, ratio, resample_counts
+from sceneprior.evaluation.metric import METHOD, Counts, Estimate, ratio, resample_counts
 from sceneprior.evaluation.metrics import USE
-from sceneprior.evaluation.metrics.contents import common_label_set
-from sceneprior.evaluation.metrics.stability import stable_count
-from sceneprior.evaluation.room_sets import without_void
+from sceneprior.evaluation.metrics.contents import common_label_set, without_void
+from sceneprior.evaluation.metrics.physics import stable_count
 from sceneprior.evaluation.synthesis import FORMAT, VERSION, EvalOptions, result_of
 
 SETTLED = ("solids", "all", "none")
@@ -55,66 +54,54 @@ def measure_use(
         The metrics by set and key; and the metrics that are left out of all sets, each with what
         no generated room has (a floor, doors or windows).
     """
-    columns = {}
-    total = sum(map(len, sets.values()))
+    columns: dict[str, dict[str, Estimate]] = {}
     with Progress(console=Console(stderr=True)) as bars:
-        bar = bars.add_task("Measuring rooms", total=total)
+        bar = bars.add_task("Measuring rooms", total=sum(map(len, sets.values())))
         for number, (name, scenes) in enumerate(sets.items()):
             measured = []
             for scene in scenes:
                 measured.append(measure_room(scene, options))
                 bars.advance(bar)
-            # These seeds are far from those of `room_sets`.
+            # These seeds are far from those of `evaluate_synthesis`.
             counts = resample_counts(len(scenes), resamples, (seed, 100 + number))
-            columns[name] = {metric.key: _estimate(metric.key, measured, counts) for metric in USE}
-    missing = [metric for metric in USE if columns["generated"][metric.key].value is None]
-    reasons = {metric.key: _reason(metric, sets["generated"], options) for metric in missing}
-    for found in columns.values():
-        for key in reasons:
-            del found[key]
-    return columns, reasons
+            columns[name] = {}
+            for metric in USE:
+                shares = np.array([room.get(metric.key, (0.0, 0.0)) for room in measured], float)
+                high = np.inf if metric.key.endswith("litres") else 1.0
+                columns[name][metric.key] = ratio(*shares.reshape(-1, 2).T, counts, high)
+    left_out = {}
+    for metric in USE:
+        if columns["generated"][metric.key].value is None:
+            left_out[metric.key] = metric.needs
+            if metric.function is stable_count:
+                if options.settle == "none":
+                    left_out[metric.key] = "--settle solids"
+                elif find_spec("mujoco") is None:
+                    left_out[metric.key] = "mujoco (pip install 'sceneprior[sim]')"
+            elif not any(scene.objects for scene in sets["generated"]):
+                left_out[metric.key] = "objects in the scenes"
+            for found in columns.values():
+                del found[metric.key]
+    return columns, left_out
 
 
 def measure_room(scene: Scene, options: UseOptions) -> Counts:
     """Numerators and denominators of all metrics of use, for one room."""
     found: dict[str, tuple[float | int, float | int]] = {}
-    functions: dict[Callable[..., Any], None] = dict.fromkeys(metric.function for metric in USE)
-    for function in functions:
-        if function is not stable_count or _simulated(scene, options):
+    ready = options.settle == "all" or all(o.solids or o.mesh is None for o in scene.objects)
+    simulated = ready and options.settle != "none" and find_spec("mujoco") is not None
+    for function in dict.fromkeys(metric.function for metric in USE):
+        if simulated or function is not stable_count:
             found |= function(scene)
     return found
-
-
-def _simulated(scene: Scene, options: UseOptions) -> bool:
-    if options.settle == "none" or find_spec("mujoco") is None:
-        return False
-    ready = all(item.solids or item.mesh is None for item in scene.objects)
-    return ready or options.settle == "all"
-
-
-def _estimate(key: str, measured: Sequence[Counts], counts: np.ndarray) -> Estimate:
-    pairs = np.array([each.get(key, (0.0, 0.0)) for each in measured], dtype=float).reshape(-1, 2)
-    litres = key.endswith("litres")
-    return ratio(pairs[:, 0], pairs[:, 1], counts, np.inf if litres else 1.0)
-
-
-def _reason(metric: Metric, scenes: Sequence[Scene], options: UseOptions) -> str:
-    if metric.function is stable_count:
-        if options.settle == "none":
-            return "--settle solids"
-        if find_spec("mujoco") is None:
-            return "mujoco (pip install 'sceneprior[sim]')"
-    elif not any(scene.objects for scene in scenes):
-        return "objects in the scenes"
-    return metric.needs
 
 
 def evaluate_use(
     generated: Sequence[Scene],
     options: EvalOptions,
     use: UseOptions,
-    shards: Path | None = None,
-    scores: Mapping[str, Any] | None = None,
+    shards: Path | None,
+    scores: Mapping[str, Any] | None,
 ) -> dict[str, Any]:
     """Compute metrics of use for generated rooms and, with shards, for real and random rooms.
 
@@ -133,11 +120,11 @@ def evaluate_use(
         generated = [make_stable(scene)[0] for scene in generated]
     sets: dict[str, Sequence[Scene]] = {"generated": generated}
     if shards is not None:
-        every_train = reference_scenes(shards, "train")
-        count = min(len(generated), len(every_train))
+        train = reference_scenes(shards, "train")
+        count = min(len(generated), len(train))
         sets["test"] = reference_scenes(shards, options.split)
-        for name, make in (("shuffled", shuffled_rooms), ("independent", independent_rooms)):
-            sets[name] = make(every_train, count, options.seed, with_meshes=True)
+        sets["shuffled"] = shuffled_rooms(train, count, options.seed, with_meshes=True)
+        sets["independent"] = independent_rooms(train, count, options.seed, with_meshes=True)
         common_label_set(generated, sets["test"])
     columns, left_out = measure_use(sets, options.seed, options.resamples, use)
     if scores is None:
@@ -145,7 +132,7 @@ def evaluate_use(
         scores = {
             "format": FORMAT, "version": VERSION, "protocol": {"label_set": names, **settings}
         }  # fmt: skip
-    result = merged(dict(scores), result_of(columns))
+    result = _merged(scores, result_of(columns))
     floors = sum(scene.floor_m is not None for scene in generated)
     result["protocol"] = {
         **scores["protocol"],
@@ -168,9 +155,7 @@ def evaluate_use(
     return result
 
 
-def merged(first: dict[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
+def _merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
     """Two nested results as one; values of the second replace those of the first."""
-    for key, value in second.items():
-        both = isinstance(value, Mapping) and isinstance(first.get(key), Mapping)
-        first[key] = merged(dict(first[key]), value) if both else value
-    return first
+    both = {key for key in second if isinstance(first.get(key), Mapping)}
+    return {**first, **second} | {key: _merged(first[key], second[key]) for key in both}

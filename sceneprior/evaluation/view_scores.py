@@ -2,7 +2,6 @@
 distance, F-score and box IoU."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -68,13 +67,10 @@ def upright_box_iou_3d(a: Mesh, b: Mesh) -> float:
         >>> round(upright_box_iou_3d(cube, turned), 6)
         0.707107
     """
-    plans, lows, highs = [], [], []
-    for mesh in (a, b):
-        points = np.asarray(mesh.vertices_m, dtype=np.float64)
-        plans.append(shapely.MultiPoint(points[:, [0, 2]]).minimum_rotated_rectangle)
-        lows.append(points[:, 1].min())
-        highs.append(points[:, 1].max())
-    heights = np.subtract(highs, lows)
+    points = [np.asarray(mesh.vertices_m, dtype=np.float64) for mesh in (a, b)]
+    plans = [shapely.MultiPoint(each[:, ::2]).minimum_rotated_rectangle for each in points]
+    lows, highs = np.array([(each[:, 1].min(), each[:, 1].max()) for each in points]).T
+    heights = highs - lows
     shared = shapely.intersection(*plans).area * max(min(highs) - max(lows), 0.0)
     union = plans[0].area * heights[0] + plans[1].area * heights[1] - shared
     return float(shared / union) if union > 0 else 0.0
@@ -82,30 +78,22 @@ def upright_box_iou_3d(a: Mesh, b: Mesh) -> float:
 
 RESAMPLES = 1000
 """Number of bootstrap resamples of rooms per interval."""
-
-
-@dataclass(frozen=True)
-class ObjectPair:
-    """A true object visible in an image, and the object fitted to its mask."""
-
-    truth: SceneObject
-    found: SceneObject | None
-    """The fitted object. If it is None, the true object has IoUs and F-score 0, and no distance."""
-
-
+ObjectPair = tuple[SceneObject, SceneObject | None]
+"""A true object visible in an image, and the object fitted to its mask. If that is None, the true
+object has IoUs and F-score 0, and no distance."""
 PairScore = dict[str, Any]
 """Scores of one true object by name of `FIELDS`, its `label`, and whether it was `found` and has a
 `surface`. A score is None if it is unknown."""
 
 
-def score_pair(pair: ObjectPair, points: int = POINTS, seed: int = 0) -> PairScore:
+def score_pair(pair: ObjectPair, points: int, seed: int = 0) -> PairScore:
     """Compare two objects in the room frame; a fitted object without a mesh is its box. A true
     object without a mesh is compared by its box and class alone: compared with a box, a correct
     shape would score worse than a box.
 
     `points` are sampled from each surface, uniformly by area, with a different seed per surface.
     """
-    truth, found = pair.truth, pair.found
+    truth, found = pair
     known = truth.mesh is not None
     worst = 0.0 if known else None
     score: PairScore = dict.fromkeys(FIELDS) | {
@@ -114,11 +102,7 @@ def score_pair(pair: ObjectPair, points: int = POINTS, seed: int = 0) -> PairSco
     }  # fmt: skip
     if found is None:
         return score
-    boxes = (
-        np.array([part], dtype=np.float64)
-        for item in (truth, found)
-        for part in (item.center_m, item.size_m)
-    )
+    boxes = (np.array([part]) for o in (truth, found) for part in (o.center_m, o.size_m))
     score["box_iou_3d"] = float(box_iou_3d(*boxes)[0, 0])
     score["class_accuracy"] = found.label == truth.label
     if truth.mesh is None:
@@ -142,56 +126,41 @@ def score_views(
 
     `summary` covers all objects of all images, `intervals` holds bootstrap intervals of its
     metrics, and `classes` holds one summary per true class. `rooms` names the room of each view:
-    views of one room are not independent, so intervals resample rooms.
+    views of one room are not independent, so a room is resampled with all objects of all its views.
+    The resamples depend only on the rooms, so that several methods share them.
     """
-    scores = [
-        score_pair(pair, points, row)
-        for row, pair in enumerate(pair for view in views for pair in view)
-    ]
-    if not scores:
+    pairs = [pair for view in views for pair in view]
+    if not pairs:
         raise InputError("No image shows an object, so there is nothing to score.")
-    labels = sorted({score["label"] for score in scores})
-    by_class = {name: [score for score in scores if score["label"] == name] for name in labels}
-    return {
-        "summary": {"rooms": len(set(rooms)), "images": len(views), **summary(scores)},
-        "intervals": intervals(
-            scores, [room for room, view in zip(rooms, views, strict=True) for _ in view]
-        ),
-        "classes": {name: summary(some) for name, some in by_class.items()},
-    }
-
-
-def summary(scores: Sequence[PairScore]) -> dict[str, float | int | None]:
-    """Means over the objects that have a value, and the numbers of objects behind them."""
-
-    def mean(name: str) -> float | None:
-        known = [score[name] for score in scores if score[name] is not None]
-        return sum(known) / len(known) if known else None
-
-    return {
-        "objects": len(scores),
-        "unmatched": sum(not score["found"] for score in scores),
-        "with_surface": sum(score["surface"] for score in scores),
-        **{name: mean(name) for name in FIELDS},
-    }
-
-
-def intervals(scores: Sequence[PairScore], rooms: Sequence[str]) -> dict[str, list[float] | None]:
-    """Lower and upper end of the interval of each metric; None for a metric without a value.
-
-    `rooms` names the room of each score. A room is resampled with all objects of all its views. The
-    resamples depend only on the rooms, so that several methods share them.
-    """
-    names, number = np.unique(rooms, return_inverse=True)
+    scores = [score_pair(pair, points, row) for row, pair in enumerate(pairs)]
+    by_class = {label: [score for score in scores if score["label"] == label]
+                for label in sorted({score["label"] for score in scores})}  # fmt: skip
+    of_room = [room for room, view in zip(rooms, views, strict=True) for _ in view]
+    names, number = np.unique(of_room, return_inverse=True)
     counts = resample_counts(len(names), RESAMPLES, 0)
-    found = {}
+    intervals = {}
     for name in FIELDS:
         values = [score[name] for score in scores]
         known = np.bincount(number, [value is not None for value in values])
         sums = np.bincount(number, [value or 0.0 for value in values])
         high = np.inf if name.startswith("chamfer") else 1.0
-        found[name] = ratio(sums, known, counts, high).interval()
-    return found
+        intervals[name] = ratio(sums, known, counts, high).interval()
+    return {
+        "summary": {"rooms": len(set(rooms)), "images": len(views), **_summary(scores)},
+        "intervals": intervals,
+        "classes": {label: _summary(some) for label, some in by_class.items()},
+    }
+
+
+def _summary(scores: Sequence[PairScore]) -> dict[str, float | int | None]:
+    """Means over the objects that have a value, and the numbers of objects behind them."""
+    known = {name: [score[name] for score in scores if score[name] is not None] for name in FIELDS}
+    return {
+        "objects": len(scores),
+        "unmatched": sum(not score["found"] for score in scores),
+        "with_surface": sum(score["surface"] for score in scores),
+        **{name: sum(some) / len(some) if some else None for name, some in known.items()},
+    }
 
 
 def surface_note(objects: int, with_surface: int, shards: str) -> str | None:
@@ -207,7 +176,14 @@ def surface_note(objects: int, with_surface: int, shards: str) -> str | None:
     )
 
 
-_DEFINITIONS = {
+FIELDS = (
+    "box_iou_3d", "oriented_box_iou_3d", "chamfer_l2_m", "chamfer_squared_m2", "f_score",
+    "class_accuracy",
+)  # fmt: skip
+"""Metrics of a summary, each a mean over objects."""
+PROTOCOL = {
+    "objects": "objects that the image shows, each matched to the object fitted to its mask by the "
+    "fit's own assignment (class and 2D box); every object has the same weight",
     "box_iou_3d": "axis-aligned boxes in the room frame",
     "oriented_box_iou_3d": "upright boxes around the meshes, over the footprint's rectangle of "
     "least area",
@@ -215,14 +191,7 @@ _DEFINITIONS = {
     "metres",
     "chamfer_squared_m2": "like chamfer_l2_m with squared distances, in square metres",
     "f_score": f"at {F_THRESHOLD_M} m",
-}
-PROTOCOL = {
-    "objects": "objects that the image shows, each matched to the object fitted to its mask by the "
-    "fit's own assignment (class and 2D box); every object has the same weight",
-    **_DEFINITIONS,
     "intervals": f"{COVERAGE:.0%} bootstrap over rooms, {RESAMPLES:,} draws with replacement, all "
     "views of a room together",
 }
 """The compared objects and the metrics, as described in result files."""
-FIELDS = (*_DEFINITIONS, "class_accuracy")
-"""Metrics of a summary, each a mean over objects."""

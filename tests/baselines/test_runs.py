@@ -10,7 +10,7 @@ from sceneprior.apps.experiments.evaluate import evaluate_run
 from sceneprior.apps.experiments.report import report_run
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.files import write_json
-from sceneprior.evaluation.room_sets import without_void
+from sceneprior.evaluation.metrics.contents import without_void
 from sceneprior.evaluation.synthesis import EvalOptions
 from sceneprior.training.checkpoints import read_checkpoint
 from sceneprior.training.fit import fit

@@ -45,14 +45,6 @@ def by_all_pairings(a: Scene, b: Scene) -> float:
     return (min(totals) + len(b.objects) - len(a.objects)) / len(b.objects)
 
 
-def test_distances_of_random_rooms_are_those_of_the_best_pairing(rng):
-    for _ in range(60):
-        a, b = random_room(rng), random_room(rng)
-        expected = min(by_all_pairings(turned_a, b) for turned_a in eight(a))
-        assert nearest_distances([a], [b])[0] == pytest.approx(expected, abs=1e-9)
-        assert nearest_distances([b], [a])[0] == pytest.approx(expected, abs=1e-9)
-
-
 def turned(scene: Scene) -> Scene:
     """A quarter turn about y, +z towards +x."""
     objects = [
@@ -81,6 +73,10 @@ def test_the_nearest_room_is_found_among_all_turned_or_mirrored(rng):
     # The last is empty: it has no object to start at.
     training = [*(random_room(rng) for _ in range(30)), room()]
     scenes = [*(random_room(rng, 6) for _ in range(15)), room()]
+    for scene in scenes[:5]:
+        for other in training[:5]:
+            expected = min(by_all_pairings(turn, other) for turn in eight(scene))
+            assert nearest_distances([scene], [other])[0] == pytest.approx(expected, abs=1e-9)
     got = nearest_distances(scenes, training)
     for scene, distance in zip(scenes, got, strict=True):
         expected = min(by_all_pairings(turn, other) for turn in eight(scene) for other in training)

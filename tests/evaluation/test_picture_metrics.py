@@ -17,12 +17,12 @@ from sceneprior.evaluation.metrics.picture_classifiers import (
     REPEATS,
     classify_pictures,
     cross_validated_predictions,
+    linear,
 )
 from sceneprior.evaluation.metrics.picture_distances import (
     frechet_distance,
     in_manifold,
-    kernel_distance,
-    kernels,
+    kernel_distances,
 )
 
 
@@ -113,20 +113,22 @@ def test_kernel_distance_is_torchmetrics_where_a_subset_is_the_whole_set(two_set
     a, b = two_sets[0][:30], two_sets[1]
     theirs = KernelInceptionDistance(Plain(), subsets=1, subset_size=30, normalize=True)
     mean, _ = fed(theirs.set_dtype(torch.float64), a, b)
-    assert kernel_distance(kernels(a, b))[0] == pytest.approx(mean.item(), rel=1e-9)
+    once = np.ones((1, 30), int)
+    assert kernel_distances(a, b, once, once)[0] == pytest.approx(mean.item(), rel=1e-9)
 
 
 def test_counts_stand_for_repeated_rows_of_kernels(two_sets, rng):
     a, b = two_sets
     counts_a, counts_b = rng.integers(0, 3, size=len(a)), rng.integers(0, 3, size=len(b))
     longer_a, longer_b = a.repeat(counts_a, axis=0), b.repeat(counts_b, axis=0)
-    expected = kernel_distance(kernels(longer_a, longer_b))[0]
+    ones = (np.ones((1, len(rows)), int) for rows in (longer_a, longer_b))
+    expected = kernel_distances(longer_a, longer_b, *ones)[0]
     # A row repeated is a pair with itself in the longer set, and none where it is counted.
     own = [
         (counts * (counts - 1)) @ ((rows**2).sum(1) / 12 + 1) ** 3 / (n * (n - 1))
         for rows, counts, n in ((a, counts_a, len(longer_a)), (b, counts_b, len(longer_b)))
     ]
-    got = kernel_distance(kernels(a, b), counts_a[None], counts_b[None])
+    got = kernel_distances(a, b, counts_a[None], counts_b[None])
     assert got.shape == (1,) and sum(own) > 0
     assert got[0] == pytest.approx(expected, rel=1e-9)
 
@@ -153,9 +155,9 @@ def test_precision_and_recall_are_their_definition(two_sets, n, m):
 
 def test_sets_of_one_distribution_are_at_chance_and_far_ones_are_told_apart(rng):
     a, b = rng.normal(size=(60, 8)), rng.normal(size=(45, 8))
-    right, asked = cross_validated_predictions(a, b, seed=0)
+    right, asked = cross_validated_predictions(a, b, 0, linear, REPEATS)
     assert 0.3 < right.sum() / asked.sum() < 0.7
-    right, asked = cross_validated_predictions(a, b + 10, seed=0)
+    right, asked = cross_validated_predictions(a, b + 10, 0, linear, REPEATS)
     assert (right == asked).all()
 
 
@@ -169,7 +171,7 @@ def test_answers_are_those_of_folds_never_seen_with_equal_numbers_on_both_sides(
         return np.ones(len(others), dtype=int)  # all are generated, it says
 
     right, asked = cross_validated_predictions(
-        np.arange(20.0)[:, None], 100 + np.arange(7.0)[:, None], 1, remember
+        np.arange(20.0)[:, None], 100 + np.arange(7.0)[:, None], 1, remember, REPEATS
     )
     assert len(calls) == FOLDS * REPEATS and len({seed for *_, seed in calls}) == len(calls)
     assert asked[20:].tolist() == [REPEATS] * 7 and not right[20:].any()

@@ -11,9 +11,9 @@ from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.scene import Mesh, Scene
 from sceneprior.evaluation.features import inception_features
 from sceneprior.evaluation.metrics.contents import class_counts, common_label_set
-from sceneprior.evaluation.metrics.floor import outside_count
-from sceneprior.evaluation.metrics.picture_classifiers import check_alexnet
+from sceneprior.evaluation.metrics.picture_classifiers import alexnet_weights
 from sceneprior.evaluation.metrics.picture_distances import frechet_distance
+from sceneprior.evaluation.metrics.placement import outside_count
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
 from sceneprior.evaluation.use import UseOptions, evaluate_use
 from sceneprior.evaluation.view_scores import sample_surface, score_views
@@ -40,7 +40,7 @@ def test_rooms_are_refused_before_anything_is_drawn(shards, tmp_path, monkeypatc
     [
         ("split", lambda: EvalOptions(split="train")),
         ("settle", lambda: UseOptions("some")),
-        ("no_scenes", lambda: evaluate_use([], EvalOptions(), UseOptions())),
+        ("no_scenes", lambda: evaluate_use([], EvalOptions(), UseOptions(), None, None)),
         ("two_labels", lambda: common_label_set([OTHER], [of_classes("desk")])),
         ("nothing_counted", lambda: class_counts([])),
         ("one_picture", lambda: frechet_distance(np.zeros((1, 4)), np.zeros((3, 4)))),
@@ -72,7 +72,7 @@ def test_files_that_are_no_network(tmp_path):
         with pytest.raises(InputError, match="is not the Inception network of NVIDIA's"):
             inception_features(image, tmp_path / name)
     with pytest.raises(InputError, match="is not the state dict of torchvision's AlexNet"):
-        check_alexnet(tmp_path / "text.pt")
+        alexnet_weights(tmp_path / "text.pt")
     for name in ("absent.pt", "other.pth"):
         with refused(f"evaluation/alexnet_{name}", tmp=tmp_path):
-            check_alexnet(tmp_path / name)
+            alexnet_weights(tmp_path / name)

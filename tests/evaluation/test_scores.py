@@ -18,7 +18,7 @@ from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.scene import Mesh, Opening, Scene, SceneObject, Turned
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
 from sceneprior.evaluation.use import UseOptions, evaluate_use
-from sceneprior.evaluation.view_scores import ObjectPair, score_views
+from sceneprior.evaluation.view_scores import score_views
 
 LABELS = ("double_bed", "wardrobe", "desk", "nightstand", "chair", "ceiling_lamp", "shelf")
 SIZES_M = ((1.8, 0.6, 2.0), (1.5, 2.1, 0.6), (1.2, 0.75, 0.6), (0.5, 0.5, 0.4), (0.5, 0.9, 0.5),
@@ -121,7 +121,7 @@ def rows_of_views() -> dict[tuple[str, str], list[float | None]]:
     """Scores of single-view reconstructions of the same rooms."""
     views = [
         [
-            ObjectPair(true, found if row % 4 else None)
+            (true, found if row % 4 else None)
             for row, (true, found) in enumerate(
                 zip(scene.objects, moved(scene, 0.1).objects, strict=True)
             )

@@ -11,7 +11,6 @@ from scipy.spatial.distance import cdist
 from sceneprior.core.scene import Mesh, SceneObject
 from sceneprior.core.surfaces import chamfer_of, nearest_distances
 from sceneprior.evaluation.view_scores import (
-    ObjectPair,
     f_score,
     score_pair,
     score_views,
@@ -36,7 +35,7 @@ def moved(item: SceneObject, x_m: float) -> SceneObject:
 
 
 def test_a_box_found_half_aside():
-    score = score_pair(ObjectPair(DESK, replace(moved(DESK, 0.5), label="sofa")), POINTS)
+    score = score_pair((DESK, replace(moved(DESK, 0.5), label="sofa")), POINTS)
     assert score["box_iou_3d"] == pytest.approx(1 / 3)
     assert score["oriented_box_iou_3d"] == pytest.approx(1 / 3)
     assert not score["class_accuracy"]
@@ -48,7 +47,7 @@ def test_a_box_found_half_aside():
 
 
 def test_every_object_weighs_the_same_and_nothing_found_is_no_number():
-    views = [[ObjectPair(DESK, DESK), ObjectPair(BED, None)], [ObjectPair(DESK, None)]]
+    views = [[(DESK, DESK), (BED, None)], [(DESK, None)]]
     scores = score_views(views, ["a", "a"], POINTS)
     summary = scores["summary"]
     assert (summary["rooms"], summary["images"], summary["objects"]) == (1, 2, 3)
@@ -66,12 +65,12 @@ def test_every_object_weighs_the_same_and_nothing_found_is_no_number():
 def test_a_box_is_no_surface():
     """A true object without a mesh is compared by box and class; its other scores are None, and the
     scores of other objects stay the same."""
-    score = score_pair(ObjectPair(replace(DESK, mesh=None), moved(DESK, 0.5)), POINTS)
+    score = score_pair((replace(DESK, mesh=None), moved(DESK, 0.5)), POINTS)
     assert (score["box_iou_3d"], score["class_accuracy"]) == (pytest.approx(1 / 3), True)
     unknown = ("oriented_box_iou_3d", "chamfer_l2_m", "chamfer_squared_m2", "f_score")
     assert all(score[name] is None for name in unknown)
-    assert score_pair(ObjectPair(replace(DESK, mesh=None), None), POINTS)["f_score"] is None
-    mixed = [[ObjectPair(BED, moved(BED, 0.1)), ObjectPair(replace(DESK, mesh=None), DESK)]]
+    assert score_pair((replace(DESK, mesh=None), None), POINTS)["f_score"] is None
+    mixed = [[(BED, moved(BED, 0.1)), (replace(DESK, mesh=None), DESK)]]
     one, two = (score_views(v, ["a"], POINTS)["summary"] for v in (mixed, [mixed[0][:1]]))
     assert (one["objects"], one["with_surface"], two["with_surface"]) == (2, 1, 1)
     assert all(one[name] == two[name] for name in unknown)

@@ -1,4 +1,4 @@
-"""Slow, plain twins of `sceneprior/evaluation/surfaces.py`."""
+"""Slow, plain twins of `sceneprior/evaluation/geometry.py`."""
 
 import numpy as np
 

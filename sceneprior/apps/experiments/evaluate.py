@@ -24,10 +24,10 @@ from sceneprior.evaluation.metrics.contents import (
     class_counts,
     common_label_set,
     reconstruction_scores,
+    shared_volume_m3,
+    without_void,
 )
-from sceneprior.evaluation.metrics.overlaps import room_overlaps
-from sceneprior.evaluation.room_sets import seeded_rows
-from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis, result_of
+from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis, result_of, seeded_rows
 from sceneprior.evaluation.use import UseOptions, evaluate_use
 from sceneprior.paper.config import PaperConfig
 from sceneprior.paper.fit_image import decode_images, view_loss
@@ -208,6 +208,7 @@ def evaluate_from_views(
     The result holds the generated rooms' scores by key of `METRICS`, the real training rooms'
     scores under `train_rooms`, and the test rooms' scores under `<key>_test`.
     """
+    generated = [without_void(scene) for scene in generated]
     names = common_label_set(generated)
     rooms = {split: _counted(shards, split, names) for split in ("train", options.split)}
     counts = {
@@ -227,9 +228,9 @@ def evaluate_from_views(
         if name != "test":
             found["category_kl"] = category_kl(table, counts["test"], draws[name], draws["test"])
         columns[name] = found
-    volumes = [room_overlaps(scene).volumes_m3.sum() for scene in generated]
-    columns["generated"]["overlap_volume_m3"] = mean_of_rooms(volumes, draws["generated"])
     measured = columns["generated"]
+    volumes = [shared_volume_m3(scene) for scene in generated]
+    measured["overlap_volume_m3"] = mean_of_rooms(volumes, draws["generated"])
     return result_of(columns) | {
         "note": " ".join(filter(None, (emptiness(generated), _NOTE))),
         "protocol": {

@@ -22,7 +22,6 @@ from sceneprior.evaluation.score_table import wide_console
 from sceneprior.evaluation.view_scores import (
     POINTS,
     PROTOCOL,
-    ObjectPair,
     score_views,
     surface_note,
 )
@@ -207,7 +206,7 @@ def score_answers(
         views = []
         for image, objects in zip(images, some, strict=True):
             shown = [truth[image.room_id][row] for row in image.rows]
-            views.append([ObjectPair(*pair) for pair in zip(shown, objects, strict=True)])
+            views.append([*zip(shown, objects, strict=True)])
         rows[name] = score_views(views, [image.room_id for image in images])
     return rows
 

@@ -16,7 +16,7 @@ from sceneprior.apps.viewer.latent_map import LatentMap, make_map
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene
 from sceneprior.evaluation.metrics.contents import common_label_set
-from sceneprior.evaluation.metrics.novelty import nearest_room
+from sceneprior.evaluation.metrics.novelty import KnownRooms
 from sceneprior.lifted.config import SAMPLER, TrainedLifted
 from sceneprior.paper.interpolate import RoomPath, even_places
 from sceneprior.paper.prior import TrainedPrior
@@ -201,7 +201,7 @@ class Explorer:
 
     def nearest(self, scene: Scene) -> tuple[Shown, float]:
         """The decoded training room with the nearest layout, and its distance in metres."""
-        row, distance_m = nearest_room(scene, self._training_layouts)
+        row, distance_m = KnownRooms(self._training_layouts).nearest(scene)
         return self.training_room(row), distance_m
 
     def layouts(self) -> Sequence[Scene]:

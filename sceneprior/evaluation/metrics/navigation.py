@@ -1,18 +1,22 @@
 """Free floor on a pixel map, and the space before doors and windows: SceneEval's NAV and opening
 clearance, PhyScene's R_out, R_reach and walkable area."""
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import shapely
 from jaxtyping import Bool, Float, Int
 
-from sceneprior.core.boxes import yaw_rotation
 from sceneprior.core.scene import Opening, Scene
 from sceneprior.core.shell import floor_polygon
+from sceneprior.evaluation.geometry import (
+    Points,
+    footprint,
+    in_own_box,
+    point_count,
+    triangles_of,
+)
 from sceneprior.evaluation.metric import USED, Counts, metric
-from sceneprior.evaluation.surfaces import Triangles, footprint, own_box, triangles_of
 
 PIXELS = 256
 """Width and height of the floor map in pixels."""
@@ -26,13 +30,11 @@ BEFORE_WINDOW_M = 0.5
 TEST_M = 0.1
 """Distance from an opening at which a point is tested for being in the room."""
 PIXELS_PER_M = 100
-POINTS_PER_M3, FEWEST_POINTS = 5000, 64
-"""Test points per cubic metre of an object's box, and their minimum number."""
+FEWEST_POINTS = 64
 TOLERANCE_M = 1e-6
 
 
-@dataclass(frozen=True)
-class FloorMap:
+class FloorMap(NamedTuple):
     """Pixel map of a room's floor and objects, for a robot of one width."""
 
     floor: Bool[np.ndarray, "pixels pixels"]
@@ -61,8 +63,7 @@ def floor_map(scene: Scene, robot_m: float) -> FloorMap | None:
     """
     import cv2
 
-    outline = floor_polygon(scene)
-    if outline is None:
+    if floor_polygon(scene) is None:
         return None
     corners = np.asarray(scene.floor_m, dtype=np.float64)
     middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
@@ -188,31 +189,36 @@ def clear_openings(scene: Scene) -> Counts:
         in the room. SceneEval's openings are 1 mm thick, which adds 0.5 mm to the depth; here they
         have no thickness.
     """
+    import cv2
+
     floor = floor_polygon(scene)
     if floor is None or not scene.openings:
         return {}
     draws = np.random.default_rng(0)
-    points = []
-    for item in scene.objects:
-        yaw_rad, size_m, _ = own_box(item)
-        count = max(int(np.prod(size_m) * POINTS_PER_M3), FEWEST_POINTS)
-        inner = draws.uniform(-0.5, 0.5, (count, 3)) * np.asarray(size_m)
-        points.append(inner @ yaw_rotation(yaw_rad).T + np.asarray(item.center_m))
-    surfaces = [triangles_of(item) for item in scene.objects]
-    shares = []
-    for opening in scene.openings:
-        frame = _Frame.of(opening, floor)
-        if frame is not None:
-            before = [
-                surface
-                for surface, inner in zip(surfaces, points, strict=True)
-                if frame.holds(inner)
-            ]
-            shares.append(frame.covered_share(before))
-    covered = [share for share in shares if share is not None]
+    points = [
+        in_own_box(item, draws.uniform(-0.5, 0.5, (point_count(item, FEWEST_POINTS), 3)))
+        for item in scene.objects
+    ]
+    frames = [frame for each in scene.openings if (frame := _frame(each, floor)) is not None]
+    clear, covered = 0, 0.0
+    for frame in frames:
+        width, height, depth = frame.size_m
+        near = (
+            frame.local(triangles_of(item))
+            for item, inner in zip(scene.objects, points, strict=True)
+            if frame.holds(inner)
+        )
+        before = np.concatenate([np.zeros((0, 3, 3)), *near])
+        inward = before[:, :, 2]
+        before = before[(inward.min(axis=1) <= depth) & (inward.max(axis=1) >= 0)]
+        image = np.zeros(np.ceil([height * PIXELS_PER_M, width * PIXELS_PER_M]).astype(int), "u1")
+        for triangle in before:
+            pixels = np.stack([triangle[:, 0], height - triangle[:, 1]], axis=1) * PIXELS_PER_M
+            cv2.fillConvexPoly(image, pixels.astype(np.int32), 1)
+        clear, covered = clear + (not len(before)), covered + float(image.mean())
     return {
-        "sceneeval_clear_openings": (float(len(shares) - len(covered)), len(shares)),
-        "sceneeval_covered_openings": (float(sum(covered)), len(shares)),
+        "sceneeval_clear_openings": (float(clear), len(frames)),
+        "sceneeval_covered_openings": (covered, len(frames)),
     }
 
 
@@ -223,40 +229,24 @@ class _Frame(NamedTuple):
     axes: Float[np.ndarray, "3 3"]
     size_m: Float[np.ndarray, "3"]
 
-    @classmethod
-    def of(cls, opening: Opening, floor: shapely.Geometry) -> "_Frame | None":
-        start, end = (
-            np.array([x, opening.bottom_m, z]) for x, z in (opening.start_m, opening.end_m)
-        )
-        width = float(np.linalg.norm(end - start))
-        along = (end - start) / width
-        for inward in (np.cross(along, [0.0, 1.0, 0.0]), np.cross([0.0, 1.0, 0.0], along)):
-            tested = (start + end) / 2 + TEST_M * inward
-            if shapely.contains_xy(floor, tested[0], tested[2]):
-                depth = width if opening.kind == "door" else BEFORE_WINDOW_M
-                height = opening.top_m - opening.bottom_m
-                axes = np.array([along, [0.0, 1.0, 0.0], inward])
-                return cls(start, axes, np.array([width, height, depth]))
-        return None
+    def local(self, points: np.ndarray) -> np.ndarray:
+        return np.asarray((points - self.origin_m) @ self.axes.T)
 
-    def holds(self, points: np.ndarray) -> bool:
-        local = (points - self.origin_m) @ self.axes.T
+    def holds(self, points: Points) -> bool:
+        local = self.local(points)
         inside = (local >= -TOLERANCE_M) & (local <= self.size_m + TOLERANCE_M)
         return bool(inside.all(axis=1).any())
 
-    def covered_share(self, surfaces: list[Triangles]) -> float | None:
-        """Share of the opening's pixels covered; None if no triangle reaches into the space."""
-        import cv2
 
-        width, height, depth = self.size_m
-        shape = (int(np.ceil(height * PIXELS_PER_M)), int(np.ceil(width * PIXELS_PER_M)))
-        covered = np.zeros(shape, dtype=np.uint8)
-        blocked = False
-        for surface in surfaces:
-            local = (surface - self.origin_m) @ self.axes.T
-            reaching = (local[:, :, 2].min(axis=1) <= depth) & (local[:, :, 2].max(axis=1) >= 0)
-            blocked |= bool(reaching.any())
-            for triangle in local[reaching]:
-                pixels = np.stack([triangle[:, 0], height - triangle[:, 1]], axis=1) * PIXELS_PER_M
-                cv2.fillConvexPoly(covered, pixels.astype(np.int32), 1)
-        return float(covered.mean()) if blocked else None
+def _frame(opening: Opening, floor: shapely.Geometry) -> _Frame | None:
+    """The frame of an opening; None if the room is on neither side of it."""
+    start, end = (np.array([x, opening.bottom_m, z]) for x, z in (opening.start_m, opening.end_m))
+    width = float(np.linalg.norm(end - start))
+    along, up = (end - start) / width, np.array([0.0, 1.0, 0.0])
+    for inward in (np.cross(along, up), np.cross(up, along)):
+        tested = (start + end) / 2 + TEST_M * inward
+        if shapely.contains_xy(floor, tested[0], tested[2]):
+            depth = width if opening.kind == "door" else BEFORE_WINDOW_M
+            size_m = np.array([width, opening.top_m - opening.bottom_m, depth])
+            return _Frame(start, np.array([along, up, inward]), size_m)
+    return None

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from sceneprior.core.boxes import QUARTERS, quarter_rotation
 from sceneprior.core.scene import Scene
@@ -16,7 +16,6 @@ from sceneprior.evaluation.metric import (
     GENERATED,
     Comparison,
     Estimate,
-    Nearest,
     RoomSet,
     TableColumn,
     mean_of_rooms,
@@ -35,23 +34,88 @@ TURNS = tuple(
 """The four quarter turns of a room and of its mirror image, the augmentations of training."""
 
 
-def _costs(placed: np.ndarray, others: np.ndarray) -> np.ndarray:
-    # SciPy is imported here, since most commands import this module without comparing rooms.
-    from scipy.spatial.distance import cdist
+class KnownRooms:
+    """Rooms among which the one nearest to a scene is searched, by their layouts.
 
-    return np.asarray(np.minimum(cdist(placed, others), MISSING_M))
+    The layout distance is the mean cost, in metres, of moving and resizing one room's furniture to
+    match the other's, minimised over all of `TURNS`. Objects are paired one to one within classes
+    at minimum total cost. A pair costs the norm of (difference of centres, difference of sizes), at
+    most 1 m; an object without a partner costs 1 m. The total is divided by the number of objects
+    in the larger room: 0 for equal layouts, 1 for layouts without a common object. Two empty rooms
+    are at distance 0.
+    """
+
+    def __init__(self, rooms: Sequence[Scene]):
+        each = [_rows(room) for room in rooms]
+        self.names = np.array([room.name for room in rooms], dtype=object)
+        self.counts = np.array([len(room) for room in each], dtype=np.int64)
+        self.objects = np.concatenate([np.zeros((0, 7)), *each])
+        self.starts = np.cumsum(self.counts) - self.counts
+        self.contents = [Counter(room.class_indices.tolist()) for room in rooms]
+
+    def nearest(
+        self, scene: Scene, pass_over_own: bool = False, as_copies: bool = False
+    ) -> tuple[int, float]:
+        """Index and distance of the nearest room; the distance is inf if no room is compared.
+
+        The search is exact. A lower bound, in which every object takes its cheapest partner, rules
+        out most rooms without an assignment.
+
+        Args:
+            pass_over_own: Skip the room with the scene's name, so that none meets itself.
+            as_copies: Compare only with rooms of the same furniture, up to one object more or
+                fewer, and average over pairs only: an unpaired object costs nothing. Empty rooms
+                match no scene, and an empty scene matches no room.
+        """
+        # SciPy is imported here, since most commands import this module without comparing rooms.
+        from scipy.optimize import linear_sum_assignment
+        from scipy.spatial.distance import cdist
+
+        placed = _rows(scene)
+        smaller, larger = (take(self.counts, len(placed)) for take in (np.minimum, np.maximum))
+        skipped = (self.names == scene.name) & pass_over_own
+        if as_copies:
+            mine = Counter(scene.class_indices.tolist())
+            odd = [((mine - theirs) + (theirs - mine)).total() for theirs in self.contents]
+            skipped |= (np.array(odd, dtype=int) > 1) | (smaller == 0)
+        # distance = (total cost - free) / number; as copies, the unpaired object is free.
+        free = MISSING_M * (larger - smaller) * as_copies
+        number = np.maximum(smaller if as_copies else larger, 1)
+        best, found = np.inf, 0
+        for turn in TURNS if not skipped.all() else ():
+            turned = [placed[:, :3] @ turn, placed[:, 3:6] @ np.abs(turn), placed[:, 6:]]
+            costs = np.minimum(cdist(np.hstack(turned), self.objects), MISSING_M)
+            # 1e-12 lower: a different order of summation must not rule out an equally near room.
+            bounds = (self._least_costs(costs) - free) / number - 1e-12
+            bounds[skipped] = np.inf
+            for room in np.argsort(bounds):
+                if bounds[room] >= best:
+                    break
+                own = costs[:, self.starts[room] : self.starts[room] + self.counts[room]]
+                total = own[linear_sum_assignment(own)].sum()
+                total += MISSING_M * (larger[room] - smaller[room]) - free[room]
+                if total / number[room] < best:
+                    best, found = float(total / number[room]), int(room)
+        return found, best
+
+    def _least_costs(self, costs: Float[np.ndarray, "mine objects"]) -> Float[np.ndarray, " rooms"]:
+        """Lower bound on the total cost to each room: each object's cheapest partner."""
+        mine = len(costs)
+        # `reduceat` needs a column at each start, even if the last room is empty. The extra column
+        # belongs to the last room, where it adds 0 to the sum and never lowers a minimum.
+        cheapest = np.append(costs.min(0, initial=MISSING_M), 0.0)
+        theirs = np.add.reduceat(cheapest, self.starts) * (self.counts > 0)
+        padded = np.hstack([costs, np.full((mine, 1), MISSING_M)])
+        ours = np.minimum.reduceat(padded, self.starts, axis=1)
+        ours = np.where(self.counts > 0, ours, MISSING_M).sum(0)
+        return np.maximum(
+            theirs + MISSING_M * np.maximum(mine - self.counts, 0),
+            ours + MISSING_M * np.maximum(self.counts - mine, 0),
+        )
 
 
-def _total(costs: np.ndarray) -> float:
-    """The least total cost of pairing the objects of two rooms one to one."""
-    from scipy.optimize import linear_sum_assignment
-
-    matched = float(costs[linear_sum_assignment(costs)].sum()) if min(costs.shape) else 0.0
-    return matched + MISSING_M * (max(costs.shape) - min(costs.shape))
-
-
-def _rows(scene: Scene) -> np.ndarray:
-    """(objects, 7): centre, size, and the class index scaled so that only equal classes pair."""
+def _rows(scene: Scene) -> Float[np.ndarray, "objects 7"]:
+    """Centre, size, and the class index scaled so that only equal classes pair."""
     label = _CLASS_STEP * scene.class_indices[:, None]
     return np.hstack([scene.centers_m, scene.sizes_m, label])
 
@@ -62,126 +126,9 @@ def nearest_distances(
     pass_over_own: bool = False,
     as_copies: bool = False,
 ) -> Float[np.ndarray, " scenes"]:
-    """Layout distance of each scene to the nearest training room, minimised over all of `TURNS`.
-
-    The distance is the mean cost, in metres, of moving and resizing one room's furniture to match
-    the other's. Objects are paired one to one within classes at minimum total cost. A pair costs
-    the norm of (difference of centres, difference of sizes), at most 1 m; an object without a
-    partner costs 1 m. The total is divided by the number of objects in the larger room: 0 for equal
-    layouts, 1 for layouts without a common object. Two empty rooms are at distance 0.
-
-    The search is exact. A lower bound, in which every object takes its cheapest partner, rules out
-    most training rooms without an assignment. The distance of a scene that has no training room to
-    be compared with is inf.
-
-    Args:
-        pass_over_own: Skip the training room with the scene's name, so that none meets itself.
-        as_copies: Compare only with rooms of the same furniture, up to one object more or fewer,
-            and average over pairs only: an unpaired object costs nothing.
-    """
-    rooms = _Rooms(training)
-    names = np.array([room.name for room in training])
-    nearest = np.full(len(scenes), np.inf)
-    for row, scene in enumerate(scenes):
-        allowed = np.ones(len(training), dtype=bool)
-        if pass_over_own:
-            allowed &= names != scene.name
-        if as_copies:
-            allowed &= rooms.hold_the_same(scene)
-        if allowed.any():
-            nearest[row] = rooms.nearest(scene, allowed, as_copies)[1]
-    return nearest
-
-
-def nearest_room(scene: Scene, training: Sequence[Scene]) -> tuple[int, float]:
-    """Index of the training room nearest to a scene, and its distance as in `nearest_distances`.
-
-    `training` must not be empty.
-    """
-    return _Rooms(training).nearest(scene, np.ones(len(training), dtype=bool))
-
-
-class _Rooms:
-    """Index of rooms for nearest-room searches."""
-
-    def __init__(self, rooms: Sequence[Scene]):
-        each = [_rows(room) for room in rooms]
-        self.counts = np.array([len(room) for room in each], dtype=np.int64)
-        self.objects = np.concatenate([np.zeros((0, 7)), *each])
-        self.starts = np.cumsum(self.counts) - self.counts
-        self.contents = [Counter(room.class_indices.tolist()) for room in rooms]
-
-    def hold_the_same(self, scene: Scene) -> Bool[np.ndarray, " rooms"]:
-        """True for rooms with a scene's furniture, up to one object more or fewer.
-
-        Empty rooms match no scene, and an empty scene matches no room.
-        """
-        mine = Counter(scene.class_indices.tolist())
-        odd = [((mine - theirs) + (theirs - mine)).total() for theirs in self.contents]
-        fewest = np.minimum(self.counts, mine.total())
-        return np.asarray((np.array(odd, dtype=int) <= 1) & (fewest > 0))
-
-    def nearest(
-        self, scene: Scene, allowed: Bool[np.ndarray, " rooms"], as_copies: bool = False
-    ) -> tuple[int, float]:
-        """Index and distance of the nearest allowed room; at least one must be allowed."""
-        best, found, placed = np.inf, 0, _rows(scene)
-        smaller = np.minimum(self.counts, len(placed))
-        larger = np.maximum(self.counts, len(placed))
-        # distance = (total cost - free) / number; as copies, the unpaired object is free.
-        free = MISSING_M * (larger - smaller) * as_copies
-        number = np.maximum(smaller if as_copies else larger, 1)
-        for turn in TURNS:
-            costs = _costs(_turned(placed, turn), self.objects)
-            least = _lower_bounds(costs, self.starts, self.counts)
-            # 1e-12 lower: a different order of summation must not rule out an equally near room.
-            bounds = np.where(allowed, (least - free) / number - 1e-12, np.inf)
-            for room in np.argsort(bounds):
-                if bounds[room] >= best:
-                    break
-                start = self.starts[room]
-                total = _total(costs[:, start : start + self.counts[room]])
-                distance = float((total - free[room]) / number[room])
-                if distance < best:
-                    best, found = distance, int(room)
-        return found, float(best)
-
-
-def _turned(rows: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    return np.hstack([rows[:, :3] @ turn, rows[:, 3:6] @ np.abs(turn), rows[:, 6:]])
-
-
-def _lower_bounds(costs: np.ndarray, starts: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Lower bound on the total cost to each training room: each object's cheapest partner."""
-    mine = len(costs)
-    # `reduceat` needs a column at each start, even if the last room is empty. The extra column
-    # belongs to the last room, where it adds 0 to the sum and never lowers a minimum.
-    cheapest = np.append(costs.min(0, initial=MISSING_M), 0.0)
-    theirs = np.add.reduceat(cheapest, starts) * (counts > 0)
-    ours = np.minimum.reduceat(np.hstack([costs, np.full((mine, 1), MISSING_M)]), starts, axis=1)
-    ours = np.where(counts > 0, ours, MISSING_M).sum(0)
-    return np.asarray(
-        np.maximum(
-            theirs + MISSING_M * np.maximum(mine - counts, 0),
-            ours + MISSING_M * np.maximum(counts - mine, 0),
-        )
-    )
-
-
-def nearest_known(
-    scenes: Sequence[Scene],
-    training: Sequence[Scene],
-    decoded: Sequence[Scene],
-    pass_over_own: bool = False,
-) -> Nearest:
-    """Distances of each scene to the nearest true and, if any, decoded training room."""
-
-    def to(rooms: Sequence[Scene], as_copies: bool = False) -> np.ndarray:
-        return nearest_distances(scenes, rooms, pass_over_own, as_copies)
-
-    return Nearest(
-        to(training), to(decoded) if decoded else None, to([*training, *decoded], as_copies=True)
-    )
+    """Layout distance of each scene to the nearest training room; see `KnownRooms.nearest`."""
+    rooms = KnownRooms(training)
+    return np.array([rooms.nearest(scene, pass_over_own, as_copies)[1] for scene in scenes])
 
 
 NEAR_COPY_QUANTILE = 0.01
@@ -217,15 +164,18 @@ def near_copy_threshold(training: Sequence[Scene]) -> float:
     ),
 )  # fmt: skip
 def _nearest(rooms: RoomSet, comparison: Comparison) -> Estimate:
-    return mean_of_rooms(rooms.nearest.training_m, rooms.counts)
+    own = comparison.trained_on(rooms)
+    return mean_of_rooms(nearest_distances(rooms.scenes, comparison.train, own), rooms.counts)
 
 
 @metric(
     "nearest_decoded_m", "Distance to the nearest decoded training room", "mean, metres", "none"
 )
 def _nearest_decoded(rooms: RoomSet, comparison: Comparison) -> Estimate | None:
-    distances = rooms.nearest.decoded_m
-    return None if distances is None else mean_of_rooms(distances, rooms.counts)
+    if not comparison.decoded:
+        return None
+    own = comparison.trained_on(rooms)
+    return mean_of_rooms(nearest_distances(rooms.scenes, comparison.decoded, own), rooms.counts)
 
 
 @metric(
@@ -242,8 +192,9 @@ def _nearest_decoded(rooms: RoomSet, comparison: Comparison) -> Estimate | None:
     ),
 )  # fmt: skip
 def _near_copy_share(rooms: RoomSet, comparison: Comparison) -> Estimate:
-    copies = rooms.nearest.as_copies_m < comparison.near_copy_m
-    return mean_of_rooms(copies, rooms.counts, 1.0)
+    known, own = [*comparison.train, *comparison.decoded], comparison.trained_on(rooms)
+    distances = nearest_distances(rooms.scenes, known, own, as_copies=True)
+    return mean_of_rooms(distances < comparison.near_copy_m, rooms.counts, 1.0)
 
 
 @metric(
@@ -251,5 +202,6 @@ def _near_copy_share(rooms: RoomSet, comparison: Comparison) -> Estimate:
     GENERATED,
 )  # fmt: skip
 def _near_copy_excess(rooms: RoomSet, comparison: Comparison) -> Estimate:
-    real = _near_copy_share(comparison.test, comparison)
-    return _near_copy_share(rooms, comparison).combined(real, np.subtract)
+    columns = comparison.columns
+    ours, real = (columns[name]["near_copy_share"] for name in ("generated", "test"))
+    return ours.combined(real, np.subtract)

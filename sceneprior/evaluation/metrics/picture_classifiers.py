@@ -74,8 +74,8 @@ def cross_validated_predictions(
     generated: Shaped[np.ndarray, "n ..."],
     real: Shaped[np.ndarray, "m ..."],
     seed: int,
-    classify: Classify = linear,
-    repeats: int = REPEATS,
+    classify: Classify,
+    repeats: int,
 ) -> tuple[Int[np.ndarray, " rooms"], Int[np.ndarray, " rooms"]]:
     """Numbers of correct and of all predictions for each room, generated rooms first, by
     classifiers trained on the other folds.
@@ -105,11 +105,6 @@ def cross_validated_predictions(
     return right, asked
 
 
-def check_alexnet(path: Path) -> None:
-    """Raise InputError if the file is missing or does not hold AlexNet's weights."""
-    _weights(path)
-
-
 def classify_pictures(
     path: Path,
     pictures: UInt8[np.ndarray, "rooms 224 224 3"],
@@ -129,7 +124,10 @@ def classify_pictures(
     # The random state is forked, so that the caller's random numbers do not depend on this call.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        network = _network(_weights(path)).to(device)
+        weights, convolutions = alexnet_weights(path), _convolutions()
+        convolutions.load_state_dict(weights)
+        parts = *convolutions, nn.AdaptiveAvgPool2d(6), nn.Flatten(), nn.Linear(256 * 36, 1)
+        network = nn.Sequential(*parts).to(device)
     order = np.random.default_rng(seed)
     optimizer = torch.optim.Adam(network.parameters(), lr=LEARNING_RATE)
     for _ in range(EPOCHS):
@@ -167,16 +165,10 @@ def _convolutions() -> nn.Sequential:
     )  # fmt: skip
 
 
-def _network(weights: dict[str, Tensor]) -> nn.Sequential:
-    convolutions = _convolutions()
-    convolutions.load_state_dict(weights)
-    return nn.Sequential(
-        *convolutions, nn.AdaptiveAvgPool2d(6), nn.Flatten(), nn.Linear(256 * 36, 1)
-    )
-
-
 @lru_cache(maxsize=1)
-def _weights(path: Path) -> dict[str, Tensor]:
+def alexnet_weights(path: Path) -> dict[str, Tensor]:
+    """The weights of AlexNet's convolutions in a file of torchvision's, refused if it is another
+    file."""
     if not path.is_file():
         raise InputError(
             f"No AlexNet at {path}. The paper's SCA needs torchvision's file "
@@ -205,7 +197,7 @@ def _accuracy(
 ) -> Estimate:
     test = comparison.test
     right, asked = cross_validated_predictions(
-        rooms.features(kind), test.features(kind), comparison.seed, classify, repeats
+        rooms.pictures[kind], test.pictures[kind], comparison.seed, classify, repeats
     )
     n = len(rooms.scenes)
     # Both sets have the same weight.

@@ -120,70 +120,61 @@ def gap_closed(ours: float, independent: float, real: float) -> float:
     return (independent - ours) / (independent - real)
 
 
-def _distance(boxes: bool, network: str, rooms: RoomSet, comparison: Comparison) -> Estimate:
-    a, b = rooms.features(network, boxes), comparison.test.features(network, boxes)
+def _distance(suffix: str, network: str, rooms: RoomSet, comparison: Comparison) -> Estimate:
+    a, b = (each.pictures[network + suffix] for each in (rooms, comparison.test))
     counts = zip(rooms.counts, comparison.test.counts, strict=True)
-    resamples = np.array([frechet_distance(a, b, *pair) for pair in counts])
-    return Estimate(frechet_distance(a, b), resamples, 0.0)
+    return Estimate(np.array([frechet_distance(a, b, *pair) for pair in counts]), 0.0)
 
 
-def _gap(boxes: bool, network: str, rooms: RoomSet, comparison: Comparison) -> Estimate:
-    key, known = FRECHET[network] + ("_boxes" if boxes else ""), comparison.columns
-    furthest = "independent" if boxes else "independent_meshes"
-    ours = _distance(boxes, network, rooms, comparison)
-    distances = (ours, known[furthest][key], known["train_rooms"][key])
-    value = gap_closed(*(distance.value or 0.0 for distance in distances))
-    # Resamples repeat rooms, which raises all distances, so each distance's resamples are shifted
-    # until their mean equals its value.
-    moved = [
-        (d.value or 0.0) + d.resamples - d.resamples.mean() for d in distances if len(d.resamples)
-    ]
-    return Estimate(value, np.array([gap_closed(*three) for three in zip(*moved, strict=True)]))
+def _gap(suffix: str, network: str, rooms: RoomSet, comparison: Comparison) -> Estimate:
+    key, known = FRECHET[network] + suffix, comparison.columns
+    furthest = "independent" if suffix else "independent_meshes"
+    ours = known["generated"][key]
+    distances = [ours, known[furthest][key], known["train_rooms"][key]]
+    values = np.array([distance.values for distance in distances])
+    if len(rooms.counts) > 1:
+        # Resamples repeat rooms, which raises all distances, so each distance's resamples are
+        # shifted until their mean equals its value.
+        values[:, 1:] += values[:, :1] - values[:, 1:].mean(axis=1, keepdims=True)
+    return Estimate(np.array([gap_closed(*three) for three in values.T.tolist()]))
 
 
-Kernels = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Kernel matrices within two sets and between them, computed once for all resamples."""
-
-
-def kernels(a: Float[np.ndarray, "n dimensions"], b: Float[np.ndarray, "m dimensions"]) -> Kernels:
-    """Values of KID's kernel, k(x, y) = (x . y / dimensions + 1)^3, for all pairs of rows."""
-    check_features(a, b)
-    a, b = a.astype(np.float64), b.astype(np.float64)
-
-    def kernel(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        return (x @ y.T / x.shape[1] + 1) ** 3
-
-    return kernel(a, a), kernel(b, b), kernel(a, b)
-
-
-def kernel_distance(
-    of: Kernels,
-    counts_a: Int[np.ndarray, "resamples n"] | None = None,
-    counts_b: Int[np.ndarray, "resamples m"] | None = None,
-) -> Float[np.ndarray, " resamples"]:
-    """Squared maximum mean discrepancy, unbiased, in float64.
+def kernel_distances(
+    a: Float[np.ndarray, "n dimensions"],
+    b: Float[np.ndarray, "m dimensions"],
+    counts_a: Int[np.ndarray, "sets n"],
+    counts_b: Int[np.ndarray, "sets m"],
+) -> Float[np.ndarray, " sets"]:
+    """Squared maximum mean discrepancy, unbiased, in float64, with the kernel of KID,
+    k(x, y) = (x . y / dimensions + 1)^3.
 
     For two samples of one distribution its expectation is 0, whatever their sizes, and it may be
     negative. KID is often reported as the mean over random subsets. The mean over all subsets of a
     size equals the estimate on the whole sets, which is computed here and needs no seed.
 
-    `counts_*` hold the multiplicity of each row, one line per resample; None: each row once.
+    `counts_*` hold the multiplicity of each row, one line per set of rows.
     """
-    aa, bb, ab = of
-    counts_a = np.ones((1, len(aa)), int) if counts_a is None else counts_a
-    counts_b = np.ones((1, len(bb)), int) if counts_b is None else counts_b
-    n, m = counts_a.sum(1), counts_b.sum(1)
-    within_a = ((counts_a @ aa) * counts_a).sum(1) - counts_a @ aa.diagonal()
-    within_b = ((counts_b @ bb) * counts_b).sum(1) - counts_b @ bb.diagonal()
-    between = ((counts_a @ ab) * counts_b).sum(1)
-    return np.asarray(within_a / (n * (n - 1)) + within_b / (m * (m - 1)) - 2 * between / (n * m))
+    check_features(a, b)
+    a, b = a.astype(np.float64), b.astype(np.float64)
+    aa, bb, ab = ((x @ y.T / x.shape[1] + 1) ** 3 for x, y in ((a, a), (b, b), (a, b)))
+
+    def distances(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        n, m = u.sum(1), v.sum(1)
+        within_a = ((u @ aa) * u).sum(1) - u @ aa.diagonal()
+        within_b = ((v @ bb) * v).sum(1) - v @ bb.diagonal()
+        between = ((u @ ab) * v).sum(1)
+        return np.asarray(
+            within_a / (n * (n - 1)) + within_b / (m * (m - 1)) - 2 * between / (n * m)
+        )
+
+    # The first alone, so that its last digits do not depend on how many sets follow.
+    first, rest = (distances(counts_a[rows], counts_b[rows]) for rows in (slice(1), slice(1, None)))
+    return np.concatenate([first, rest])
 
 
 def _kernel_distance(network: str, rooms: RoomSet, comparison: Comparison) -> Estimate:
-    test = comparison.test
-    pairs = kernels(rooms.features(network), test.features(network))
-    resamples = kernel_distance(pairs, rooms.counts, test.counts)
-    return Estimate(float(kernel_distance(pairs)[0]), resamples)
+    features = rooms.pictures[network], comparison.test.pictures[network]
+    return Estimate(kernel_distances(*features, rooms.counts, comparison.test.counts))
 
 
 def in_manifold(
@@ -207,14 +198,14 @@ def in_manifold(
 
 def _precision(network: str, rooms: RoomSet, comparison: Comparison) -> Estimate:
     if emptiness(rooms.scenes) is not None:
-        return Estimate(None, np.zeros(0))
-    inside = in_manifold(rooms.features(network), comparison.test.features(network))
+        return Estimate(np.full(len(rooms.counts), np.nan))
+    inside = in_manifold(rooms.pictures[network], comparison.test.pictures[network])
     return mean_of_rooms(inside, rooms.counts, 1.0)
 
 
 def _recall(network: str, rooms: RoomSet, comparison: Comparison) -> Estimate:
     test = comparison.test
-    covered = in_manifold(test.features(network), rooms.features(network))
+    covered = in_manifold(test.pictures[network], rooms.pictures[network])
     return mean_of_rooms(covered, test.counts, 1.0)
 
 
@@ -250,53 +241,36 @@ _PROTOCOL = {
 }
 
 
-def _define(network: str, short: str, kernel: str, frechet: tuple[str, str]) -> None:
-    """Define the metrics of one network's features, in the order of tables."""
-    lite = network == "effnet_lite0"
-    key, gap = FRECHET[network], "gap_closed" if lite else f"gap_closed_{network}"
-    ends, long = "0: independent, 1: as near as real", "EfficientNet-Lite0" if lite else short
-
-    def define(
-        metric_key: str, title: str, unit: str, direction: Direction, sets: tuple[str, ...],
-        function: Callable[..., Any], boxes: bool = False,
-    ) -> None:  # fmt: skip
-        metric(
-            metric_key, title, unit, direction, sets, network, boxes,
-            protocol=_PROTOCOL.get(metric_key, {}), column=_COLUMNS.get(metric_key),
-        )(partial(function, network))  # fmt: skip
-
-    define(key, frechet[0], "", "closer", PICTURED, partial(_distance, False))
-    define(
-        f"{gap}_furnished", f"Gap closed, from independent furniture, {short}", ends, "higher",
-        GENERATED, partial(_gap, False),
-    )  # fmt: skip
-    define(f"{key}_boxes", frechet[1], "", "closer", AGAINST_TEST, partial(_distance, True), True)
-    define(
-        f"{gap}_boxes", f"Gap closed, all rooms as boxes, {short}", ends, "higher", GENERATED,
-        partial(_gap, True), True,
-    )  # fmt: skip
-    kid = f"kid_{network}" if lite else "kid"
-    define(kid, kernel, "", "closer", PICTURED, _kernel_distance)
-    define(
-        f"precision_{network}", f"Precision, {long}", "share of rooms", "higher", PICTURED,
-        _precision,
-    )  # fmt: skip
-    define(
-        f"recall_{network}", f"Recall, {long}", "share of test rooms", "higher", PICTURED, _recall
-    )
-
-
-_define(
-    "inception", "Inception", "KID (Inception)",
-    ("FID (Inception)", "FID, all rooms as boxes (Inception)"),
-)  # fmt: skip
-_define(
-    "effnet_lite0", "Lite0", "Kernel distance, EfficientNet-Lite0 (not KID)",
-    (
+_ENDS = "0: independent, 1: as near as real"
+for _network, _gap_key, _kid, _titles in (
+    ("inception", "gap_closed_inception", "kid", (
+        "FID (Inception)", "Gap closed, from independent furniture, Inception",
+        "FID, all rooms as boxes (Inception)", "Gap closed, all rooms as boxes, Inception",
+        "KID (Inception)", "Precision, Inception", "Recall, Inception",
+    )),
+    ("effnet_lite0", "gap_closed", "kid_effnet_lite0", (
         "Frechet distance, EfficientNet-Lite0 (not FID)",
+        "Gap closed, from independent furniture, Lite0",
         "Frechet distance, all rooms as boxes, Lite0 (not FID)",
-    ),
-)  # fmt: skip
+        "Gap closed, all rooms as boxes, Lite0",
+        "Kernel distance, EfficientNet-Lite0 (not KID)", "Precision, EfficientNet-Lite0",
+        "Recall, EfficientNet-Lite0",
+    )),
+):  # fmt: skip
+    _metrics: tuple[tuple[str, str, Direction, tuple[str, ...], Callable[..., Any]], ...] = (
+        (FRECHET[_network], "", "closer", PICTURED, partial(_distance, "")),
+        (f"{_gap_key}_furnished", _ENDS, "higher", GENERATED, partial(_gap, "")),
+        (f"{FRECHET[_network]}_boxes", "", "closer", AGAINST_TEST, partial(_distance, "_boxes")),
+        (f"{_gap_key}_boxes", _ENDS, "higher", GENERATED, partial(_gap, "_boxes")),
+        (_kid, "", "closer", PICTURED, _kernel_distance),
+        (f"precision_{_network}", "share of rooms", "higher", PICTURED, _precision),
+        (f"recall_{_network}", "share of test rooms", "higher", PICTURED, _recall),
+    )
+    for _title, (_key, _unit, _better, _sets, _function) in zip(_titles, _metrics, strict=True):
+        metric(
+            _key, _title, _unit, _better, _sets, _network, _key.endswith("_boxes"),
+            protocol=_PROTOCOL.get(_key, {}), column=_COLUMNS.get(_key),
+        )(partial(_function, _network))  # fmt: skip
 
 
 @metric(
@@ -305,4 +279,5 @@ _define(
 )  # fmt: skip
 def _recall_ratio(rooms: RoomSet, comparison: Comparison) -> Estimate:
     real = comparison.columns["train_rooms"]["recall_effnet_lite0"]
-    return _recall("effnet_lite0", rooms, comparison).combined(real, np.divide, low=0.0)
+    ours = comparison.columns["generated"]["recall_effnet_lite0"]
+    return ours.combined(real, np.divide, low=0.0)

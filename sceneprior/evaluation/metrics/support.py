@@ -6,17 +6,18 @@ from jaxtyping import Bool, Float
 
 from sceneprior.core.boxes import yaw_rotation
 from sceneprior.core.colliders import support_of
-from sceneprior.core.scene import Scene, SceneObject
+from sceneprior.core.scene import Scene
 from sceneprior.core.shell import floor_rectangle, rectangle
-from sceneprior.evaluation.metric import USED, Counts, metric
-from sceneprior.evaluation.surfaces import (
+from sceneprior.evaluation.geometry import (
     Points,
     Triangles,
     area_centroid,
     bounds,
+    reaching,
     triangles_of,
     vertical_crossings,
 )
+from sceneprior.evaluation.metric import USED, Counts, metric
 
 NEAR_M = 0.01
 """Length of the rays, and thickness of the object's outermost layer, in which they start."""
@@ -52,32 +53,26 @@ def supported(scene: Scene) -> Float[np.ndarray, " objects"]:
         such as a television on its stand.
     """
     surfaces = [triangles_of(item) for item in scene.objects]
-    rooms = _planes(scene)
-    found = np.zeros(len(surfaces))
+    planes = _planes(scene)
+    found = np.full(len(surfaces), np.nan)
     for row, item in enumerate(scene.objects):
+        others = np.concatenate([*surfaces[:row], *surfaces[row + 1 :], *planes])
         kind = support_of(item)
-        others = np.concatenate([*surfaces[:row], *surfaces[row + 1 :], *rooms.values()])
         if kind == "ceiling":
-            known = scene.ceiling_m is not None
             up = np.array([0.0, 1.0, 0.0])
-            found[row] = len(_contacts(surfaces[row], others, up, row)) > 0 if known else np.nan
-            continue
-        found[row] = _stands(surfaces[row], others, row)
-        if kind == "wall" and not found[row]:
-            known = scene.floor_m is not None
-            found[row] = _on_wall(item, surfaces[row], others, row) if known else np.nan
+            if scene.ceiling_m is not None:
+                found[row] = len(_contacts(surfaces[row], others, up, row)) > 0
+        elif _stands(surfaces[row], others, row):
+            found[row] = 1
+        elif kind == "ground":
+            found[row] = 0
+        elif scene.floor_m is not None:
+            yaws_rad = np.arange(4) * np.pi / 2
+            if item.turned is not None:
+                yaws_rad = np.array([item.turned.yaw_rad])
+            back = yaw_rotation(yaws_rad) @ [0.0, 0.0, -1.0]
+            found[row] = any(len(_contacts(surfaces[row], others, each, row)) for each in back)
     return found
-
-
-def _on_wall(item: SceneObject, surface: Triangles, others: Triangles, seed: int) -> bool:
-    backwards = [np.array([0.0, 0.0, -1.0])]
-    yaw_rad = 0.0 if item.turned is None else item.turned.yaw_rad
-    if item.turned is None:
-        backwards += [yaw_rotation(quarter * np.pi / 2) @ backwards[0] for quarter in (1, 2, 3)]
-    return any(
-        len(_contacts(surface, others, yaw_rotation(yaw_rad) @ each, seed)) > 0
-        for each in backwards
-    )
 
 
 def _stands(surface: Triangles, others: Triangles, seed: int) -> bool:
@@ -93,14 +88,16 @@ def _contacts(
     surface: Triangles, others: Triangles, gravity: Float[np.ndarray, "3"], seed: int
 ) -> Points:
     """Points where an object's rays hit other surfaces, in a frame in which gravity is -y."""
-    turn = _downwards(gravity)
+    up = np.array([0.0, 1.0, 0.0])
+    turn = np.array([np.cross(-gravity, up), -gravity, up])
+    if gravity[1]:
+        turn = np.diag([1.0, -gravity[1], -gravity[1]])
     surface = surface @ turn.T + np.array([0.0, LIFT_M, 0.0])
     starts = _ray_starts(surface, seed)
     others = others @ turn.T
     low, high = starts.min(axis=0), starts.max(axis=0)
     low[1] -= NEAR_M
-    reached = (others.max(axis=1) >= low) & (others.min(axis=1) <= high)
-    hits = vertical_crossings(starts, others[reached.all(axis=1)])
+    hits = vertical_crossings(starts, others[reaching(others, low, high)])
     distance = starts[hits.point, 1] - hits.height_m
     near = (distance >= 0) & (distance < NEAR_M)
     contacts = starts[hits.point[near]]
@@ -126,38 +123,23 @@ def _ray_starts(surface: Triangles, seed: int) -> Points:
     return np.concatenate([vertices, points.reshape(-1, 3)])
 
 
-def _downwards(gravity: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """A rotation that takes a vertical or horizontal direction to -y."""
-    if gravity[1]:
-        return np.diag([1.0, -1.0, -1.0]) if gravity[1] > 0 else np.eye(3)
-    up = np.array([0.0, 1.0, 0.0])
-    return np.array([np.cross(-gravity, up), -gravity, up])
-
-
-def _planes(scene: Scene) -> dict[str, Triangles]:
-    """Triangles of the floor, the walls and the ceiling, as far as the scene knows them."""
+def _planes(scene: Scene) -> list[Triangles]:
+    """Triangles of the floor, the ceiling and the walls, as far as the scene knows them."""
     outline = scene.floor_m if scene.floor_m is not None else rectangle(*floor_rectangle(scene))
     outline = np.asarray(outline, dtype=np.float64)
     pieces = shapely.get_parts(
         shapely.constrained_delaunay_triangles(shapely.make_valid(shapely.Polygon(outline)))
     )
     flat = np.array([shapely.get_coordinates(piece)[:3] for piece in pieces])
-    floor = np.insert(flat, 1, 0.0, axis=2)
-    found = {"floor": floor}
+    planes = [np.insert(flat, 1, 0.0, axis=2)]
     if scene.ceiling_m is not None:
-        found["ceiling"] = floor + np.array([0.0, scene.ceiling_m, 0.0])
+        planes.append(np.insert(flat, 1, scene.ceiling_m, axis=2))
     if scene.floor_m is not None:
         top = HIGH_M if scene.ceiling_m is None else scene.ceiling_m
-        starts, ends = (
-            np.insert(each, 1, 0.0, axis=1) for each in (outline, np.roll(outline, -1, axis=0))
-        )
-        up = np.array([0.0, top, 0.0])
-        lower, upper = (
-            np.stack([starts, ends, ends + up], 1),
-            np.stack([starts, ends + up, starts + up], 1),
-        )
-        found["walls"] = np.concatenate([lower, upper])
-    return found
+        low, high = (np.insert(outline, 1, height, axis=1) for height in (0.0, top))
+        ends = [np.roll(low, -1, axis=0), np.roll(high, -1, axis=0)]
+        planes += [np.stack([low, *ends], axis=1), np.stack([low, ends[1], high], axis=1)]
+    return planes
 
 
 @metric(

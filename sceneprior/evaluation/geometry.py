@@ -1,4 +1,4 @@
-"""Geometry of object surfaces for metrics of use: rays, points inside, intersections, voxels."""
+"""Geometry of a room that metrics share: pairs of boxes, footprints, and surfaces as triangles."""
 
 from typing import NamedTuple
 
@@ -18,25 +18,78 @@ AT_ONCE = 1_000_000
 """Maximum number of pairs compared in one array."""
 
 
+class BoxPairs(NamedTuple):
+    """All pairs of boxes of a room."""
+
+    rows: tuple[Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"]]
+    """Indices of the first and the second box."""
+    apart_m: Float[np.ndarray, "pairs 2"]
+    """Distance of the centres along x and along z."""
+    gaps_m: Float[np.ndarray, " pairs"]
+    """Distance of the footprints on the floor; 0 if they touch or overlap."""
+    volumes_m3: Float[np.ndarray, " pairs"]
+    """Volume shared by the two boxes."""
+    shares: Float[np.ndarray, " pairs"]
+    """Shared volume as a part of the smaller box's volume."""
+    depths_m: Float[np.ndarray, " pairs"]
+    """Penetration depth: the smallest shift along one axis that separates the boxes."""
+
+
+def box_pairs(
+    centers_m: Float[np.ndarray, "objects 3"], sizes_m: Float[np.ndarray, "objects 3"]
+) -> BoxPairs:
+    """Compare every pair of a room's axis-aligned boxes.
+
+    A box is larger than its object (a chair pushed under a table, a rotated object), so boxes also
+    intersect in real rooms: compare results with those of real rooms.
+    """
+    a, b = np.triu_indices(len(centers_m), k=1)
+    low, high = centers_m - sizes_m / 2, centers_m + sizes_m / 2
+    shared = np.clip(np.minimum(high[a], high[b]) - np.maximum(low[a], low[b]), 0, None)
+    volumes, each = shared.prod(1), sizes_m.prod(1)
+    smaller = np.minimum(each[a], each[b])
+    apart = np.abs(centers_m[a] - centers_m[b])[:, ::2]
+    reach = (sizes_m[a] + sizes_m[b])[:, ::2] / 2
+    depths = np.minimum(high[a] - low[b], high[b] - low[a]).min(axis=1, initial=np.inf)
+    return BoxPairs(
+        (a, b),
+        apart,
+        np.linalg.norm(np.maximum(apart - reach, 0), axis=1),
+        volumes,
+        np.divide(volumes, smaller, out=np.zeros_like(volumes), where=smaller > 0),
+        np.where(volumes > 0, depths, 0.0),
+    )
+
+
 def own_box(item: SceneObject) -> Turned:
     """The object's oriented box; if its yaw is unknown, its axis-aligned box with yaw 0."""
     return item.turned or Turned(0.0, item.size_m)
 
 
+def in_own_box(item: SceneObject, unit: Points) -> Points:
+    """Move points of the unit cube about the origin into the object's `own_box`."""
+    yaw_rad, size_m, _ = own_box(item)
+    return np.asarray(
+        (unit * np.asarray(size_m)) @ yaw_rotation(yaw_rad).T + np.asarray(item.center_m)
+    )
+
+
 def footprint(item: SceneObject) -> Float[np.ndarray, "4 2"]:
     """Corners (x, z) of the object's `own_box` on the floor, in order."""
-    yaw_rad, size_m, _ = own_box(item)
-    corners = np.array([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]]) / 2 * np.asarray(size_m)
-    return np.asarray((corners @ yaw_rotation(yaw_rad).T + np.asarray(item.center_m))[:, ::2])
+    corners = np.array([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]]) / 2
+    return in_own_box(item, corners)[:, ::2]
 
 
 def triangles_of(item: SceneObject) -> Triangles:
     """Triangles of the object's mesh or, if it has none, of its `own_box`."""
     if item.mesh is not None:
         return np.asarray(item.mesh.vertices_m, dtype=np.float64)[item.mesh.faces]
-    yaw_rad, size_m, _ = own_box(item)
-    corners = CUBE_CORNERS / 2 * np.asarray(size_m)
-    return np.asarray((corners @ yaw_rotation(yaw_rad).T + np.asarray(item.center_m))[BOX_FACES])
+    return in_own_box(item, CUBE_CORNERS / 2)[BOX_FACES]
+
+
+def point_count(item: SceneObject, fewest: int) -> int:
+    """Number of points that represent an object: 5,000 per cubic metre of its box, or `fewest`."""
+    return max(int(np.prod(own_box(item).size_m) * 5000), fewest)
 
 
 def bounds(triangles: Triangles) -> Float[np.ndarray, "2 3"]:
@@ -117,11 +170,16 @@ def inside(points: Points, triangles: Triangles) -> Bool[np.ndarray, " points"]:
     return np.asarray(np.round(turns) != 0)
 
 
+def reaching(triangles: Triangles, low: np.ndarray, high: np.ndarray) -> Bool[np.ndarray, " _"]:
+    """True for triangles whose box reaches into the box between two corners."""
+    return ((triangles.max(axis=1) >= low) & (triangles.min(axis=1) <= high)).all(axis=1)
+
+
 def meeting_pairs(a: Triangles, b: Triangles) -> Int[np.ndarray, "pairs 2"]:
     """Index pairs of triangles of a and b that share a point, found by the separating axis test."""
-    low, high = np.maximum(bounds(a)[0], bounds(b)[0]), np.minimum(bounds(a)[1], bounds(b)[1])
-    rows = np.flatnonzero(((a.min(axis=1) <= high) & (a.max(axis=1) >= low)).all(axis=1))
-    columns = np.flatnonzero(((b.min(axis=1) <= high) & (b.max(axis=1) >= low)).all(axis=1))
+    rows, columns = (
+        np.flatnonzero(reaching(one, *bounds(other))) for one, other in ((a, b), (b, a))
+    )
     found = [np.zeros((0, 2), dtype=np.int64)]
     b_low, b_high = b[columns].min(axis=1), b[columns].max(axis=1)
     for some in np.array_split(rows, max(1, len(rows) * len(columns) // AT_ONCE)):
@@ -168,37 +226,3 @@ def edge_hits(a: Triangles, b: Triangles) -> Points:
             hit = known & (u >= 0) & (v >= 0) & (u + v <= 1) & (t >= 0) & (t <= 1)
             found.append((start + t[:, None] * along)[hit])
     return np.concatenate(found)
-
-
-class Voxels(NamedTuple):
-    """A solid as cells whose centres are whole multiples of the pitch."""
-
-    cells: Bool[np.ndarray, "x y z"]
-    first: Int[np.ndarray, "3"]
-    """Coordinates, in pitches, of the first cell's centre."""
-
-
-def voxelize(triangles: Triangles, pitch_m: float) -> Voxels:
-    """Cells that a surface passes through or encloses.
-
-    Points on the surface, at most half a pitch apart, are rounded to cells, as in trimesh's
-    `voxelized(pitch).fill()`, which divides triangles until their edges are that short.
-    """
-    from scipy.ndimage import binary_fill_holes
-
-    longest = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2).max(axis=1)
-    steps = np.maximum(np.ceil(longest / (pitch_m / 2)), 1)
-    # Steps are powers of two, so that there are few distinct grids.
-    steps = 2 ** np.ceil(np.log2(steps)).astype(np.int64)
-    low, high = np.round(bounds(triangles) / pitch_m).astype(np.int64)
-    grid = np.zeros(high - low + 1, dtype=bool)
-    for count in np.unique(steps):
-        u, v = np.divmod(np.arange((count + 1) ** 2), count + 1)
-        weights = np.stack([count - u - v, u, v], axis=1)[u + v <= count] / count
-        some = triangles[steps == count]
-        for few in np.array_split(some, len(some) * len(weights) // AT_ONCE + 1):
-            points = np.round(np.matmul(weights, few) / pitch_m).astype(np.int64) - low
-            # A corner's coordinate, computed as a weighted sum, may round to the next cell.
-            points = points.clip(0, high - low).reshape(-1, 3)
-            grid.ravel()[np.ravel_multi_index(tuple(points.T), grid.shape)] = True
-    return Voxels(binary_fill_holes(grid), low)
