@@ -9,13 +9,7 @@ import typer
 
 from data_prep.cli import add_commands
 from sceneprior import __version__
-from sceneprior.apps.cli import (
-    evaluating,
-    generating,
-    reconstruction,
-    sharing,
-    training,
-)
+from sceneprior.apps.cli import evaluation, rooms, runs
 
 app = typer.Typer(
     name="sceneprior",
@@ -26,12 +20,12 @@ app = typer.Typer(
 )
 add_commands(app)
 for command in (
-    training.fit, training.report,
-    generating.synthesize, generating.interpolate, generating.complete, generating.retrieve,
-    reconstruction.reconstruct, reconstruction.eval_svr,
-    sharing.pack, sharing.priors, sharing.export,
-    evaluating.evaluate, evaluating.eval_fid,
-    training.compare, training.demo, generating.view,
+    runs.fit, evaluation.report,
+    rooms.synthesize, rooms.interpolate, rooms.complete, rooms.retrieve,
+    rooms.reconstruct, evaluation.eval_svr,
+    runs.pack, runs.priors, runs.export,
+    evaluation.evaluate, evaluation.eval_fid,
+    runs.compare, runs.demo, rooms.view,
 ):  # fmt: skip
     app.command()(command)
 

@@ -15,80 +15,79 @@ if TYPE_CHECKING:
     from sceneprior.core.scene import Scene
     from sceneprior.core.shell import ShellName
 
+
+def option(told: str, *names: str, **limits: Any) -> Any:
+    """A typer option with its help text, and its names if they do not follow from the parameter."""
+    return typer.Option(*names, help=told, **limits)
+
+
 Run = Annotated[
     str,
-    typer.Option(
-        help="The trained prior: the folder of a run that `fit` made, a packed prior, the name of "
+    option(
+        "The trained prior: the folder of a run that `fit` made, a packed prior, the name of "
         "a shipped one (see `priors`), or hf://OWNER/NAME."
     ),
 ]
 Distribution = Annotated[
     str | None,
-    typer.Option(
-        help="Distribution that new rooms are drawn from: sampler, paper, or kernel, which gives "
+    option(
+        "Distribution that new rooms are drawn from: sampler, paper, or kernel, which gives "
         "near copies of training rooms (default: the config's)."
     ),
 ]
-Count = Annotated[int, typer.Option("-n", "--count", min=1, help="Number of rooms to make.")]
+Count = Annotated[int, option("Number of rooms to make.", "-n", "--count", min=1)]
 Seed = Annotated[
     int,
-    typer.Option(
-        min=0, max=LARGEST_SEED, help="Seed of all random choices: the same seed, the same result."
-    ),
+    option("Seed of all random choices: the same seed, the same result.", min=0, max=LARGEST_SEED),
 ]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")]
+Overwrite = Annotated[bool, option("Replace existing files.", "--overwrite")]
 Shell = Annotated[
     str | None,
-    typer.Option(
-        help="Parts of the room itself to write: walls (with floor and ceiling), floor, or none."
-    ),
+    option("Parts of the room itself to write: walls (with floor and ceiling), floor, or none."),
 ]
 Inception = Annotated[
-    Path | None, typer.Option(help="The file inception-2015-12-05.pt (TorchScript), for FID.")
+    Path | None, option("The file inception-2015-12-05.pt (TorchScript), for FID.")
 ]
-Accelerator = Annotated[str, typer.Option(help="Device to train on: cpu, gpu or auto (Lightning).")]
-Scenes = Annotated[
-    Path | None, typer.Option(help="A folder of scene JSONs of any method, in place of --run.")
-]
+Accelerator = Annotated[str, option("Device to train on: cpu, gpu or auto (Lightning).")]
+Scenes = Annotated[Path | None, option("A folder of scene JSONs of any method, in place of --run.")]
+Fit = Annotated[str, option("Fit: objects (one by one), or paper (one latent, in 1,000 steps).")]
+Limit = Annotated[int | None, option("Number of rooms (default: all).", min=1)]
+Restarts = Annotated[int, option("Latents to fit to each image; the best is kept.", min=1)]
 MODELS_HELP = (
     "a 3D-FUTURE-model folder, shards, or a folder with GLBs or OBJs in sub-folders by class."
 )
 OWN_HELP = "Default: the package's own furniture."
 Cad = Annotated[
-    bool,
-    typer.Option("--cad", help="Replace decoded meshes by models of the package's own furniture."),
+    bool, option("Replace decoded meshes by models of the package's own furniture.", "--cad")
 ]
 Cache = Annotated[
-    Path | None,
-    typer.Option(help="Folder that keeps the CAD models' points (default: ~/.cache/sceneprior)."),
+    Path | None, option("Folder that keeps the CAD models' points (default: ~/.cache/sceneprior).")
 ]
 
 
 def request_of(
     floor: Annotated[
         str | None,
-        typer.Option(
-            help="Floor of the rooms: 4x3 (metres along x and z), corners '0,0 5,0 5,3 2,3 2,5 "
+        option(
+            "Floor of the rooms: 4x3 (metres along x and z), corners '0,0 5,0 5,3 2,3 2,5 "
             "0,5', or a file with a floor (FILE, or FILE:ROOM of a 3D-FRONT house); samplers only."
         ),
     ] = None,
     openings: Annotated[
-        str | None,
-        typer.Option(help="Doors and windows: door,window@north,door@south:1.5 (samplers only)."),
+        str | None, option("Doors and windows: door,window@north,door@south:1.5 (samplers only).")
     ] = None,
     ceiling: Annotated[
-        float | None, typer.Option(help="Height of the ceiling in metres (samplers only).")
+        float | None, option("Height of the ceiling in metres (samplers only).")
     ] = None,
     want: Annotated[
         str | None,
-        typer.Option(
-            help="Wishes: 'a double bed and two nightstands beside it', or numbers of objects: "
+        option(
+            "Wishes: 'a double bed and two nightstands beside it', or numbers of objects: "
             "'nightstand: 2, desk: 0' (samplers only)."
         ),
     ] = None,
     request: Annotated[
-        Path | None,
-        typer.Option(help="JSON of a request: floor, openings, wishes (samplers only)."),
+        Path | None, option("JSON of a request: floor, openings, wishes (samplers only).")
     ] = None,
 ) -> dict[str, Any]:
     """The arguments of `Prior.sample` from the options of a request and its file."""

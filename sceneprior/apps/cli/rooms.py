@@ -1,4 +1,4 @@
-"""Commands that generate, complete or view rooms, or retrieve models; imports wait for the call.
+"""Commands that make, change and view rooms; each imports its dependencies when called.
 
 Pictures are rendered by the z-buffer, because without a GPU, GL is slower and takes a second to
 start.
@@ -11,26 +11,26 @@ from typing import Annotated, Any
 import typer
 
 from sceneprior.apps.cli import options
+from sceneprior.apps.cli.options import option
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import check_free
 
-BROKEN_TOLD = 5
-"""Maximum number of broken models whose reasons `retrieve` prints."""
-EMPTY_TOLD = 5
-"""Maximum number of empty rooms that `synthesize` names."""
+MOST_TOLD = 5
+"""Maximum number of broken models, or of empty rooms, that a command names."""
+_END_HELP = "a training room's id, seed:7, or a latent in a file: scenes/latents.npz:seed0_0003."
 
 
 @options.with_request
 def synthesize(
     run: options.Run,
-    out: Annotated[Path, typer.Option(help="Folder for the scenes.")],
+    out: Annotated[Path, option("Folder for the scenes.")],
     count: options.Count = 16,
     seed: options.Seed = 0,
     distribution: options.Distribution = None,
     asked: Any = None,
     cad: options.Cad = False,
     html: Annotated[
-        bool, typer.Option("--html", help="Also write rooms.html, one page of 3D models.")
+        bool, option("Also write rooms.html, one page of 3D models.", "--html")
     ] = False,
     shell: options.Shell = None,
     overwrite: options.Overwrite = False,
@@ -55,23 +55,20 @@ def synthesize(
         write_rooms_page(out / PAGE_FILE, scenes, title="New rooms", subtitle=told, shell=drawn)
     typer.echo(f"Wrote {options.rooms_in_words(count)} to {out} (from: {origin})")
     if empty := [scene.name for scene in scenes if not scene.objects]:
-        more = f" and {len(empty) - EMPTY_TOLD} more" * (len(empty) > EMPTY_TOLD)
+        more = f" and {len(empty) - MOST_TOLD} more" * (len(empty) > MOST_TOLD)
         typer.echo(
             f"Note: {len(empty)} of {count} rooms are empty (no object): "
-            f"{', '.join(empty[:EMPTY_TOLD])}{more}. Train longer, or on more rooms.",
+            f"{', '.join(empty[:MOST_TOLD])}{more}. Train longer, or on more rooms.",
             err=True,
         )
 
 
-_END_HELP = "a training room's id, seed:7, or a latent in a file: scenes/latents.npz:seed0_0003."
-
-
 def interpolate(
     run: options.Run,
-    start: Annotated[str, typer.Option("--from", help=f"First room: {_END_HELP}")],
-    end: Annotated[str, typer.Option("--to", help="Last room, named like the first one.")],
-    out: Annotated[Path, typer.Option(help="Folder for the rooms and pictures.")],
-    steps: Annotated[int, typer.Option(min=2, max=1000, help="Rooms, both ends included.")] = 9,
+    start: Annotated[str, option(f"First room: {_END_HELP}", "--from")],
+    end: Annotated[str, option("Last room, named like the first one.", "--to")],
+    out: Annotated[Path, option("Folder for the rooms and pictures.")],
+    steps: Annotated[int, option("Rooms, both ends included.", min=2, max=1000)] = 9,
     overwrite: options.Overwrite = False,
 ) -> None:
     """Interpolate between two rooms on the sphere: rooms, a strip and an animation."""
@@ -90,13 +87,12 @@ def interpolate(
 @options.with_request
 def complete(
     run: options.Run,
-    given: Annotated[Path, typer.Option(help="Scene JSON of the given objects.")],
-    out: Annotated[Path, typer.Option(help="Folder for the completed rooms.")],
+    given: Annotated[Path, option("Scene JSON of the given objects.")],
+    out: Annotated[Path, option("Folder for the completed rooms.")],
     count: options.Count = 4,
     seed: options.Seed = 0,
     classes: Annotated[
-        str | None,
-        typer.Option(help="Classes of the objects to add: double_bed,nightstand."),
+        str | None, option("Classes of the objects to add: double_bed,nightstand.")
     ] = None,
     asked: Any = None,
     cad: options.Cad = False,
@@ -130,11 +126,97 @@ def complete(
             typer.echo(f"Note: {room.name} has no place for {', '.join(lacking)}.", err=True)
 
 
+def reconstruct(
+    run: options.Run,
+    out: Annotated[Path, option("Folder for the rooms.")],
+    shards: Annotated[Path | None, option("Shards with the images.")] = None,
+    room: Annotated[str | None, option("Id of a room of the shards.")] = None,
+    view: Annotated[int, option("Index of the room's view, from 0.", min=0)] = 0,
+    split: Annotated[
+        str | None, option("Split of which to use one view per room: train or test.")
+    ] = None,
+    limit: options.Limit = None,
+    mask: Annotated[
+        Path | None, option("Masks of your own image: a PNG of ids, or COCO's JSON.")
+    ] = None,
+    classes: Annotated[Path | None, option("Classes of the PNG's ids, as CSV or JSON.")] = None,
+    intrinsics: Annotated[
+        str | None, option("Intrinsics: fov=73, 35mm=26, fx,fy,cx,cy or a JSON file.")
+    ] = None,
+    pose: Annotated[Path | None, option("JSON of your camera's pose.")] = None,
+    camera_height: Annotated[
+        float | None,
+        option("Height of your camera in m, without --pose (default: tries several).", min=0.1),
+    ] = None,
+    gravity: Annotated[
+        str | None, option("Direction of gravity in your camera's axes, without --pose: x,y,z.")
+    ] = None,
+    fit: options.Fit = "objects",
+    restarts: options.Restarts = 1,
+    seed: options.Seed = 0,
+    overwrite: options.Overwrite = False,
+) -> None:
+    """Reconstruct rooms from the instance masks of single images: JSON, GLB and pictures."""
+    from sceneprior.apps.api import load
+    from sceneprior.apps.reconstruction.export import write_page, write_reconstructions
+    from sceneprior.apps.reconstruction.own_image import read_own_image
+    from sceneprior.apps.reconstruction.reconstruct import OBJECTS
+    from sceneprior.core.boxes import QUARTERS
+    from sceneprior.core.views import image_from_shards, images_of_split
+
+    ways = [mask is not None, room is not None, split is not None]
+    if sum(ways) != 1 or (shards is None) != (mask is not None):
+        raise InputError(
+            "Say what to reconstruct from, in exactly one way: --shards with --room (and --view); "
+            "--shards with --split; or --mask with --intrinsics (and --classes)."
+        )
+    if mask is None and any(given is not None for given in (classes, intrinsics, pose, gravity)):
+        raise InputError("--classes, --intrinsics, --pose and --gravity belong to --mask.")
+    if pose is not None and gravity is not None:
+        raise InputError("--pose already gives the direction of gravity; leave out --gravity.")
+    if (limit is not None and split is None) or (view and room is None):
+        raise InputError("--limit belongs to --split, and --view to --room.")
+    check_free(out, overwrite)
+    prior = load(run)
+    notes = []
+    if shards is None:
+        if mask is None or intrinsics is None:
+            raise InputError("--mask needs --intrinsics and, for a PNG, --classes.")
+        # Object-by-object fits do not depend on the side of the room at which the camera stands.
+        sides = 1 if fit == OBJECTS else QUARTERS
+        own = read_own_image(
+            mask, classes, intrinsics, prior.label_set, pose, camera_height, sides, gravity
+        )
+        images, notes = list(own.images), [f"{note}." for note in own.notes]
+    elif room is not None:
+        images = [image_from_shards(shards, room, view)]
+    else:
+        images, blank = images_of_split(shards, split or "test", seed, limit)
+        notes = [f"no view of room {name} shows an object; it is left out." for name in blank]
+    for note in notes:
+        typer.echo(f"Note: {note}", err=True)
+    found = prior.reconstruct(images, fit, restarts)
+    if mask is not None:  # one image with several candidate cameras: the best fit is kept
+        found = [min(found, key=lambda one: one.score)]
+        if len(images) > 1:
+            height_m = found[0].image.eye_m[1]
+            typer.echo(f"Note: a camera {height_m:g} m above the floor fits best.", err=True)
+    taken_for = {pair for one in found for pair in one.taken_for.items()}
+    for name, other in sorted(taken_for):
+        typer.echo(
+            f"Note: the run never generates the class {name}; a {other} is used instead.", err=True
+        )
+    write_reconstructions(found, out)
+    if mask is not None:
+        write_page(found[0], out)
+    typer.echo(f"Wrote {options.rooms_in_words(len(found))} to {out}")
+
+
 def retrieve(
-    scenes: Annotated[Path, typer.Option(help="Folder of scene JSONs, with their GLBs.")],
-    out: Annotated[Path, typer.Option(help="Folder for the scenes with CAD models.")],
+    scenes: Annotated[Path, option("Folder of scene JSONs, with their GLBs.")],
+    out: Annotated[Path, option("Folder for the scenes with CAD models.")],
     models: Annotated[
-        Path | None, typer.Option(help=f"CAD models: {options.MODELS_HELP} {options.OWN_HELP}")
+        Path | None, option(f"CAD models: {options.MODELS_HELP} {options.OWN_HELP}")
     ] = None,
     cache: options.Cache = None,
     overwrite: options.Overwrite = False,
@@ -172,7 +254,7 @@ def retrieve(
     broken = report["broken_models"]
     if broken:
         typer.echo(f"{len(broken)} models are broken; see retrieval.json")
-    for reason in [*broken.values()][:BROKEN_TOLD]:
+    for reason in [*broken.values()][:MOST_TOLD]:
         typer.echo(f"Note: {reason}.", err=True)
     typer.echo(f"Wrote {options.rooms_in_words(len(made))} to {out}")
 
@@ -184,16 +266,14 @@ def view(
     ],
     models: Annotated[
         Path | None,
-        typer.Option(
-            help=f"Models that the page may show: {options.MODELS_HELP} {options.OWN_HELP}"
-        ),
+        option(f"Models that the page may show: {options.MODELS_HELP} {options.OWN_HELP}"),
     ] = None,
     asked: Any = None,
     shell: options.Shell = None,
     host: Annotated[
-        str, typer.Option(help="Address to serve on; 0.0.0.0 opens the page to your network.")
+        str, option("Address to serve on; 0.0.0.0 opens the page to your network.")
     ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=1, max=65535, help="Port to serve on.")] = 8080,
+    port: Annotated[int, option("Port to serve on.", min=1, max=65535)] = 8080,
     cache: options.Cache = None,
 ) -> None:
     """View rooms in the browser, request new ones, and explore the latent space of a run.

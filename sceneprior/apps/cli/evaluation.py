@@ -1,4 +1,4 @@
-"""The commands evaluate and eval-fid; they import their dependencies when called."""
+"""Commands that score rooms and write reports; each imports its dependencies when called."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from sceneprior.apps.cli import options
+from sceneprior.apps.cli.options import option
 from sceneprior.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -15,23 +16,21 @@ if TYPE_CHECKING:
 GENERATED, MEASURED = 1000, 200
 
 SomeRunOption = Annotated[
-    str | None, typer.Option(help="The run or prior that makes the rooms, as in `synthesize`.")
+    str | None, option("The run or prior that makes the rooms, as in `synthesize`.")
 ]
 AlexnetOption = Annotated[
-    Path | None, typer.Option(help="The file alexnet-owt-7be5be79.pth, for the paper's SCA.")
+    Path | None, option("The file alexnet-owt-7be5be79.pth, for the paper's SCA.")
 ]
 SplitOption = Annotated[
-    str, typer.Option(help="Rooms to compare with: test to report, val to choose settings.")
+    str, option("Rooms to compare with: test to report, val to choose settings.")
 ]
 BoxesOption = Annotated[
-    bool, typer.Option("--boxes", help="Also compare layouts only: all rooms drawn as boxes.")
+    bool, option("Also compare layouts only: all rooms drawn as boxes.", "--boxes")
 ]
 ResamplesOption = Annotated[
-    int, typer.Option(min=0, help="Number of bootstrap resamples; 0 leaves intervals out.")
+    int, option("Number of bootstrap resamples; 0 leaves intervals out.", min=0)
 ]
-OutOption = Annotated[
-    Path | None, typer.Option(help="JSON file (default: scores.json in RUN or SCENES).")
-]
+OutOption = Annotated[Path | None, option("JSON file (default: scores.json in RUN or SCENES).")]
 
 
 def eval_fid(
@@ -39,15 +38,13 @@ def eval_fid(
     scenes: options.Scenes = None,
     count: Annotated[
         int | None,
-        typer.Option(
-            "-n", "--count", min=2, help=f"Rooms (default: {GENERATED} of a run, or all scenes)."
-        ),
+        option(f"Rooms (default: {GENERATED} of a run, or all scenes).", "-n", "--count", min=2),
     ] = None,
     seed: options.Seed = 0,
     inception: options.Inception = None,
     alexnet: AlexnetOption = None,
     shards: Annotated[
-        Path | None, typer.Option(help="Shards with the test rooms (default: those of the run).")
+        Path | None, option("Shards with the test rooms (default: those of the run).")
     ] = None,
     split: SplitOption = "test",
     boxes: BoxesOption = False,
@@ -74,30 +71,26 @@ def evaluate(
     scenes: options.Scenes = None,
     count: Annotated[
         int | None,
-        typer.Option(
-            "-n", "--count", min=1, help=f"Rooms (default: {MEASURED} of a run, or all scenes)."
-        ),
+        option(f"Rooms (default: {MEASURED} of a run, or all scenes).", "-n", "--count", min=1),
     ] = None,
     seed: options.Seed = 0,
     shards: Annotated[
         Path | None,
-        typer.Option(
-            help="Shards with real rooms to compare with (default: those of the run, if they are "
+        option(
+            "Shards with real rooms to compare with (default: those of the run, if they are "
             "there); without shards, nothing is compared."
         ),
     ] = None,
     only_use: Annotated[
-        bool,
-        typer.Option("--only-use", help="Compute only metrics of use, not those of eval-fid."),
+        bool, option("Compute only metrics of use, not those of eval-fid.", "--only-use")
     ] = False,
     standing: Annotated[
-        bool,
-        typer.Option("--stand", help="First make objects stand, as `export --to mujoco` does."),
+        bool, option("First make objects stand, as `export --to mujoco` does.", "--stand")
     ] = False,
     settle: Annotated[
         str,
-        typer.Option(
-            help="Rooms to simulate: solids (whose objects have solids, or are boxes), all "
+        option(
+            "Rooms to simulate: solids (whose objects have solids, or are boxes), all "
             "(divides meshes, a minute or two each), or none."
         ),
     ] = "solids",
@@ -167,4 +160,82 @@ def _score(
         )
     write_json(target, found)
     print_scores(found)
+    typer.echo(f"Wrote {target}")
+
+
+def eval_svr(
+    shards: Annotated[Path, option("Shards with 3D ground truth.")],
+    run: Annotated[str | None, option("Run to evaluate.")] = None,
+    scenes: Annotated[
+        Path | None, option("Scenes of `reconstruct` or `retrieve`, in place of --run.")
+    ] = None,
+    split: Annotated[str, option("Split: train, val or test.")] = "test",
+    views: Annotated[int, option("Largest number of views per room.", min=1)] = 1,
+    limit: options.Limit = None,
+    out: Annotated[Path | None, option("JSON file (default: svr.json in RUN or SCENES).")] = None,
+    fit: options.Fit = "objects",
+    restarts: options.Restarts = 1,
+    models: Annotated[
+        Path | None, option(f"CAD models to put in place of the fits, too: {options.MODELS_HELP}")
+    ] = None,
+    seed: options.Seed = 0,
+) -> None:
+    """Evaluate single-view reconstruction, with training rooms as baselines."""
+    from sceneprior.apps.reconstruction.reconstruct import FitOptions
+    from sceneprior.apps.reconstruction.score import (
+        evaluate_run,
+        evaluate_scenes,
+        print_view_scores,
+    )
+    from sceneprior.core.files import write_json
+
+    if run is not None and scenes is None:
+        chosen = FitOptions(fit, restarts)
+        target = options.result_file(run, out, "svr.json")
+        found = evaluate_run(run, shards, chosen, split, seed, views, limit, models)
+    elif scenes is not None and run is None:
+        given = (views, limit, fit, restarts, models)
+        if given != (1, None, "objects", 1, None):
+            raise InputError(
+                "--views, --limit, --fit, --restarts and --models belong to --run; scenes are "
+                "evaluated as they are."
+            )
+        target = options.checked_target(out or scenes / "svr.json")
+        found = evaluate_scenes(scenes, shards, split, seed)
+    else:
+        raise InputError("Say what to evaluate: either --run, or --scenes with reconstructions.")
+    write_json(target, found)
+    print_view_scores(found)
+    typer.echo(f"Wrote {target}")
+
+
+def report(
+    run: Annotated[Path | None, option("Folder of a run that `fit` made.")] = None,
+    scenes: options.Scenes = None,
+    shards: Annotated[Path | None, option("Shards that --scenes were evaluated on.")] = None,
+    scores: Annotated[
+        Path | None, option("Scores file (default: scores.json in RUN or SCENES).")
+    ] = None,
+    out: Annotated[
+        Path | None, option("HTML file (default: report.html in RUN or SCENES).")
+    ] = None,
+    seed: options.Seed = 0,
+) -> None:
+    """Write one self-contained HTML page of a run or of scenes: inputs, curves, rooms, scores."""
+    from sceneprior.apps.experiments.report import report_folder, report_run
+
+    if run is not None and (scenes, shards) == (None, None):
+        target = out or run / "report.html"
+        if run.is_dir():
+            options.checked_target(target)
+        report_run(run, scores, target, seed)
+    elif scenes is not None and shards is not None and run is None:
+        if seed != 0:
+            raise InputError("--seed belongs to --run; scenes are shown as they are.")
+        target = options.checked_target(out or scenes / "report.html")
+        report_folder(scenes, shards, scores, target)
+    else:
+        raise InputError(
+            "Say what to report on: either --run RUN, or --scenes DIR --shards SHARDS."
+        )
     typer.echo(f"Wrote {target}")
