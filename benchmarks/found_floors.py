@@ -22,8 +22,8 @@ import shapely
 from scipy import ndimage
 from tracks import NOISES, moved, observed, rooms
 
+from data_prep.front.furnished import ModelBank
 from data_prep.front.houses import house_files, read_house
-from data_prep.front.models import ModelBank
 from data_prep.front.recipe import load_recipe
 from sceneprior.core.observations import RoomViews
 from sceneprior.core.wall_lines import Door, Wall, find_walls, seen_floor

@@ -7,7 +7,7 @@ import shapely
 from scipy.spatial.transform import Rotation
 
 from data_prep.front.furnished import Room
-from data_prep.front.viewpoints import camera_pose
+from data_prep.front.views import camera_pose
 
 EYE_M, WALL_M, AROUND_M = 1.5, 0.3, 0.2
 """Height of the camera, and its least distances from walls and from furniture."""

@@ -26,9 +26,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from data_prep.engine.plan import read_splits
-from data_prep.front.furnished import Room
+from data_prep.front.furnished import ModelBank, Room
 from data_prep.front.houses import house_files, read_house
-from data_prep.front.models import ModelBank
 from data_prep.front.recipe import Recipe, load_recipe
 from data_prep.readers.annotations import LIKE_NYU40, NYU40, Labels, read_labels
 from data_prep.readers.frames import Y_UP

@@ -22,5 +22,5 @@ def test_docstring_examples():
         "sceneprior.apps.api",
         "sceneprior.render.silhouettes.render",
         "sceneprior.render.offscreen.zbuffer",
-        "data_prep.front.viewpoints",
+        "data_prep.front.views",
     } <= having

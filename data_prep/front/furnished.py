@@ -1,15 +1,24 @@
-"""A furnished room in its own frame, and the rules of a recipe that it may break."""
+"""Furniture models of 3D-FUTURE in metres, and rooms that are furnished with them."""
 
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import shapely
+from cachetools import LRUCache, cachedmethod
 
-from data_prep.front.recipe import Recipe
-from sceneprior.core.checked import shown
+from sceneprior.core.files import file_stamp, is_name
+from sceneprior.core.furniture import MODEL_FILE, model_categories, read_obj
 from sceneprior.core.scene import Mesh
+
+_NO_FURNITURE_M = 10.0
+"""Longest plausible side of a model; nearly all models in centimetres exceed it."""
+_OVERSIZED = (50.0, 200.0)
+"""Range of the ratio between a mesh's longest side and the house's statement, for centimetres."""
+_CACHE_BYTES = 512 * 2**20
+"""Size of a process's mesh cache: about two thousand models of 3D-FUTURE's usual size."""
 
 
 @dataclass(frozen=True)
@@ -67,79 +76,61 @@ class Room:
         return np.asarray(part.exterior.coords)[:-1]
 
 
-def broken_rule(room: Room, recipe: Recipe) -> tuple[str, str] | None:
-    """First rule that the room breaks: its name and a sentence; None if it breaks none."""
-    labels = [piece.label for piece in room.furniture if piece.label != "void"]
-    x1, z1, x2, z2 = room.floor.bounds
-    if not room.furniture:
-        why = f" ({room.notes[0]})" if room.notes else ""
-        return "no_furniture", f"no usable furniture stands in it{why}"
-    parts = room.room_id.split("_")  # names of houses and rooms may contain "_", too
-    ids = {"_".join(parts[k:]) for k in range(len(parts))}
-    if not ids.isdisjoint(recipe.invalid_rooms):
-        return "invalid_rooms", "it is among the invalid_rooms"
-    pieces = len(room.furniture) + len(room.without_model)
-    least = recipe.min_models_share
-    if least is not None and len(room.furniture) < least * pieces:
-        known_ones = f"there are models of {len(room.furniture)} of its {pieces} pieces"
-        return "min_models_share", f"{known_ones}, min_models_share is {least:g}"
-    if recipe.min_objects is not None and len(labels) < recipe.min_objects:
-        unknown = ", ".join(unknown_categories(room, recipe))
-        why = f" (of no class: {unknown})" if unknown else ""
-        return "min_objects", f"{len(labels)} objects, min_objects is {recipe.min_objects}{why}"
-    if recipe.max_objects is not None and len(labels) > recipe.max_objects:
-        return "max_objects", f"{len(labels)} objects, max_objects is {recipe.max_objects}"
-    # These two rules also apply to pieces without a model.
-    known = [(piece.model_id, piece.category) for piece in room.furniture]
-    for model_id, category in (*known, *room.without_model):
-        if recipe.allowed_categories and category not in recipe.allowed_categories:
-            return "allowed_categories", f"{shown(category)} is not among allowed_categories"
-        if model_id in recipe.invalid_models:
-            return "invalid_models", f"{shown(model_id)} is among the invalid_models"
-    if recipe.required_classes and not set(labels) & set(recipe.required_classes):
-        names = ", ".join(recipe.required_classes)
-        return "required_classes", f"none of {names}, of which required_classes needs one"
-    if recipe.max_floor_m is not None and max(x2 - x1, z2 - z1) > recipe.max_floor_m:
-        floor = f"floor {x2 - x1:.2f} x {z2 - z1:.2f} m"
-        return "max_floor_m", f"{floor}, max_floor_m is {recipe.max_floor_m:g}"
-    if recipe.max_height_m is not None and room.height_m > recipe.max_height_m:
-        height = f"height {room.height_m:.2f} m"
-        return "max_height_m", f"{height}, max_height_m is {recipe.max_height_m:g}"
-    return _broken_by_meshes(room, recipe)
+class ModelBank:
+    """3D-FUTURE's models: all categories, and meshes on demand in a cache of `cache_bytes`."""
+
+    def __init__(self, folder: Path, cache_bytes: int = _CACHE_BYTES):
+        self.folder = Path(folder)
+        self._categories = model_categories(self.folder)
+        self._meshes: LRUCache = LRUCache(
+            cache_bytes, lambda mesh: mesh.vertices_m.nbytes + mesh.faces.nbytes
+        )
+
+    def category(self, model_id: str) -> str:
+        """Category of a model: lower case, "a / b" as "a/b"; "others" if the release has none."""
+        return self._categories.get(model_id, "others")
+
+    def lists(self, model_id: str) -> bool:
+        """True if the release lists this model; its mesh may nevertheless be missing."""
+        return model_id in self._categories
+
+    def has(self, model_id: str) -> bool:
+        """True if the release has a mesh of this model."""
+        return is_name(model_id) and (self.folder / model_id / MODEL_FILE).is_file()
+
+    def load(self, model_id: str) -> Mesh:
+        """Load a mesh in metres. A file is read again if it changed or was evicted from the cache.
+
+        About a hundred models of the release are in centimetres. A model with a side longer than 10
+        m is assumed to be in centimetres and scaled by 0.01; `unit_of` finds smaller models in
+        centimetres.
+        """
+        path = self.folder / model_id / MODEL_FILE
+        return self._read(path, file_stamp(path))
+
+    @cachedmethod(lambda self: self._meshes)
+    def _read(self, path: Path, stamp: tuple[int, int]) -> Mesh:
+        mesh = read_obj(path)
+        if float(np.ptp(mesh.vertices_m, axis=0).max()) > _NO_FURNITURE_M:
+            return Mesh(mesh.vertices_m / np.float32(100), mesh.faces)
+        return mesh
 
 
-def _broken_by_meshes(room: Room, recipe: Recipe) -> tuple[str, str] | None:
-    """First broken rule on mesh positions; None for a room that was read without meshes."""
-    boxes = boxes_m(room)
-    if not len(boxes):
-        return None
-    if (limits := recipe.furniture_between_m) is not None:
-        low, high = float(boxes[:, 0, 1].min()), float(boxes[:, 1, 1].max())
-        if low < limits[0] or high > limits[1]:
-            text = f"its furniture reaches from {low:.3f} to {high:.2f} m above the floor"
-            said = f"furniture_between_m is {limits[0]:g} to {limits[1]:g}"
-            return "furniture_between_m", f"{text}, {said}"
-    outside = outside_floor(room)
-    inside = 1 - outside / len(boxes)
-    if recipe.min_inside_floor is not None and inside < recipe.min_inside_floor:
-        text = f"{outside} of its {len(boxes)} pieces stand outside of the floor"
-        return "min_inside_floor", f"{text}, min_inside_floor is {recipe.min_inside_floor:g}"
-    return None
+def unit_of(mesh: Mesh, entry: dict[str, Any]) -> float:
+    """Metres per unit of a loaded mesh: 0.01 if it is 50 to 200 times as long as stated, else 1.
 
-
-def boxes_m(room: Room) -> np.ndarray:
-    """Lower and upper corner of each mesh, (pieces, 2, 3); (0, 2, 3) if no mesh was read."""
-    meshes = [piece.mesh.vertices_m for piece in room.furniture if len(piece.model.vertices_m)]
-    return np.array([(mesh.min(axis=0), mesh.max(axis=0)) for mesh in meshes]).reshape(-1, 2, 3)
-
-
-def outside_floor(room: Room) -> int:
-    """Number of pieces whose centre is not above the floor."""
-    middles = boxes_m(room).mean(axis=1)
-    return int((~shapely.covers(room.floor, shapely.points(middles[:, [0, 2]]))).sum())
-
-
-def unknown_categories(room: Room, recipe: Recipe) -> dict[str, int]:
-    """Number of pieces per category that the recipe does not mention, most frequent first."""
-    pieces = Counter(piece.category for piece in room.furniture if not recipe.knows(piece.category))
-    return dict(pieces.most_common())
+    The length is stated by the house's furniture entry. The order of axes in `size` and `bbox`
+    varies between entries, so only the longest sides are compared. This finds models in
+    centimetres that `ModelBank.load` misses because they are below 10 units long. The factor goes
+    into the placement, not into the mesh, so that a model has the same mesh in all houses.
+    """
+    longest = float(np.ptp(mesh.vertices_m, axis=0).max()) if len(mesh.vertices_m) else 0.0
+    for key in ("size", "bbox"):
+        try:
+            sides = [float(side) for side in entry.get(key)]  # type: ignore[union-attr]
+        except (TypeError, ValueError, OverflowError):
+            continue
+        plausible = len(sides) == 3 and all(1e-3 < side < 1e3 for side in sides)
+        if plausible and _OVERSIZED[0] <= longest / max(sides) <= _OVERSIZED[1]:
+            return 0.01
+    return 1.0

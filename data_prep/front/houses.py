@@ -1,6 +1,6 @@
 """Reads the houses of 3D-FRONT: their JSON files, and the rooms in them with all their quirks."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 
 from data_prep.engine.source import Line
-from data_prep.front.furnished import Furniture, Room
+from data_prep.front.furnished import Furniture, ModelBank, Room, unit_of
 from data_prep.front.geometry import (
     floor_of,
     height_of,
@@ -18,7 +18,6 @@ from data_prep.front.geometry import (
     room_frame,
     surface_of,
 )
-from data_prep.front.models import ModelBank, unit_of
 from data_prep.front.recipe import Recipe
 from sceneprior.core.checked import shown
 from sceneprior.core.errors import InputError
@@ -71,21 +70,17 @@ def house_files(folder: Path) -> list[Path]:
 def parse_house(path: Path) -> House:
     """Read the JSON of one house; raises InputError if the file is not a house."""
     data = read_json(path)
-    lists = {
-        "furniture": _inside(data, "furniture"),
-        "mesh": _inside(data, "mesh"),
-        "scene.room": _inside(_inside(data, "scene"), "room"),
-    }
-    for key, entries in lists.items():
-        if not isinstance(entries, list):
+    lists: dict[str, list[Any]] = {}
+    for key in ("furniture", "mesh", "scene.room"):
+        found = data
+        for part in key.split("."):
+            found = found.get(part) if isinstance(found, dict) else None
+        if not isinstance(found, list):
             raise InputError(f"{path.name} is not a 3D-FRONT house: it has no list '{key}'.")
+        lists[key] = found
     return House(
         path.stem, lists["scene.room"], _by_uid(lists["furniture"]), _by_uid(lists["mesh"])
     )
-
-
-def _inside(data: Any, key: str) -> Any:
-    return data.get(key) if isinstance(data, dict) else None
 
 
 def is_valid(entry: dict[str, Any]) -> bool:
@@ -218,11 +213,7 @@ class _RoomReader:
             tuple(self._furniture(placed, room_from_house, notes)),
             tuple(notes),
             shell={name: np.concatenate(parts) for name, parts in shell.items()},
-            without_model=tuple(
-                (model_id, self._category(model_id, entry))
-                for _, entry in placed
-                if not self.models.has(model_id := str(entry.get("jid") or ""))
-            ),
+            without_model=tuple(self._without_model([entry for _, entry in placed])),
         )
 
     def _surfaces(
@@ -262,7 +253,9 @@ class _RoomReader:
                     notes.append(f"{shown(model_id)} stands twice at the same place; one is kept")
                     continue
                 seen.add(key)
-                model = self._model(model_id)
+                if not self.models.has(model_id):
+                    raise InputError(f"the models folder has no {MODEL_FILE} for it")
+                model = self.models.load(model_id) if self.load_models else _NO_MESH
             except InputError as error:
                 notes.append(f"{shown(model_id)} is left out: {error}")
                 continue
@@ -283,14 +276,12 @@ class _RoomReader:
         if (np.abs(scale) < _FLAT).any():
             raise InputError(f"it is scaled by {text}, to nothing")
 
-    def _category(self, model_id: str, entry: dict[str, Any]) -> str:
-        """Category of a piece without a model: from the release's list, else from the house."""
-        said = entry.get("category")
-        if not self.models.lists(model_id) and isinstance(said, str) and said.strip():
-            return tidy_category(said)
-        return self.models.category(model_id)
-
-    def _model(self, model_id: str) -> Mesh:
-        if not self.models.has(model_id):
-            raise InputError(f"the models folder has no {MODEL_FILE} for it")
-        return self.models.load(model_id) if self.load_models else _NO_MESH
+    def _without_model(self, entries: list[dict[str, Any]]) -> Iterator[tuple[str, str]]:
+        """Model id and category of pieces without a model: from the release's list, else from the
+        house."""
+        for entry in entries:
+            model_id, said = str(entry.get("jid") or ""), entry.get("category")
+            if not self.models.has(model_id):
+                of_house = isinstance(said, str) and said.strip()
+                unlisted = of_house and not self.models.lists(model_id)
+                yield model_id, tidy_category(said) if unlisted else self.models.category(model_id)

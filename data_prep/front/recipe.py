@@ -1,10 +1,16 @@
 """Recipes: rules that select rooms of 3D-FRONT, assign classes and place cameras."""
 
+from collections import Counter
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
+import shapely
 from pydantic import BeforeValidator, Field
 
+from data_prep.front.furnished import Room
+from sceneprior.core.checked import shown
 from sceneprior.core.classes import LABEL_SETS, label_set, label_set_name
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import is_name
@@ -147,8 +153,14 @@ def load_recipe(text: str, changes: tuple[str, ...] = ()) -> Recipe:
     for change in changes:
         apply_override(data, change, "--rule")
     for key in ("invalid_rooms", "invalid_models"):
-        if isinstance(data.get(key), str):
-            data[key] = _lines(Path(data[key]), key)
+        if isinstance(file := data.get(key), str):
+            try:
+                lines = {line.strip() for line in Path(file).read_text().splitlines()}
+                data[key] = sorted(lines - {""})
+            except (OSError, UnicodeDecodeError) as error:
+                raise InputError(
+                    f"{key} names a file of ids that cannot be read ({error})."
+                ) from None
     recipe = check_settings(Recipe, data, path.name)
     if not is_name(recipe.name):
         raise InputError(
@@ -161,13 +173,6 @@ def load_recipe(text: str, changes: tuple[str, ...] = ()) -> Recipe:
                 f"{path.name}: '{used}' is not in its label set, which has {', '.join(names)}."
             )
     return recipe
-
-
-def _lines(path: Path, key: str) -> list[str]:
-    try:
-        return sorted({line.strip() for line in path.read_text().splitlines()} - {""})
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{key} names a file of ids that cannot be read ({error}).") from None
 
 
 def recipe_text(name: str) -> str:
@@ -185,3 +190,81 @@ def recipe_text(name: str) -> str:
         "# same name, or void. `label_set` may be a list of your own: [bed, night stand].\n"
     )
     return f"{text.rstrip()}\n{head}categories:\n{''.join(table)}"
+
+
+def broken_rule(room: Room, recipe: Recipe) -> tuple[str, str] | None:
+    """First rule that the room breaks: its name and a sentence; None if it breaks none.
+
+    A room that was read without meshes breaks no rule on positions.
+    """
+    return next(_broken(room, recipe), None)
+
+
+def _broken(room: Room, recipe: Recipe) -> Iterator[tuple[str, str]]:
+    labels = [piece.label for piece in room.furniture if piece.label != "void"]
+    models, pieces = len(room.furniture), len(room.furniture) + len(room.without_model)
+    if not room.furniture:
+        why = f" ({room.notes[0]})" if room.notes else ""
+        yield "no_furniture", f"no usable furniture stands in it{why}"
+    parts = room.room_id.split("_")  # names of houses and rooms may contain "_", too
+    if {"_".join(parts[k:]) for k in range(len(parts))} & set(recipe.invalid_rooms):
+        yield "invalid_rooms", "it is among the invalid_rooms"
+
+    def limited(
+        name: str, broken: Callable[[Any], bool], said: str, more: str = ""
+    ) -> Iterator[tuple[str, str]]:
+        limit = getattr(recipe, name)
+        if limit is not None and broken(limit):
+            yield name, f"{said}, {name} is {limit:g}{more}"
+
+    said = f"there are models of {models} of its {pieces} pieces"
+    yield from limited("min_models_share", lambda least: models < least * pieces, said)
+    unknown = ", ".join(unknown_categories(room, recipe))
+    why = f" (of no class: {unknown})" if unknown else ""
+    said = f"{len(labels)} objects"
+    yield from limited("min_objects", lambda least: len(labels) < least, said, why)
+    yield from limited("max_objects", lambda most: len(labels) > most, said)
+    # These two rules also apply to pieces without a model.
+    known = [(piece.model_id, piece.category) for piece in room.furniture]
+    for model_id, category in (*known, *room.without_model):
+        if recipe.allowed_categories and category not in recipe.allowed_categories:
+            yield "allowed_categories", f"{shown(category)} is not among allowed_categories"
+        if model_id in recipe.invalid_models:
+            yield "invalid_models", f"{shown(model_id)} is among the invalid_models"
+    if recipe.required_classes and not set(labels) & set(recipe.required_classes):
+        names = ", ".join(recipe.required_classes)
+        yield "required_classes", f"none of {names}, of which required_classes needs one"
+    x1, z1, x2, z2 = room.floor.bounds
+    said = f"floor {x2 - x1:.2f} x {z2 - z1:.2f} m"
+    yield from limited("max_floor_m", lambda most: max(x2 - x1, z2 - z1) > most, said)
+    said = f"height {room.height_m:.2f} m"
+    yield from limited("max_height_m", lambda most: room.height_m > most, said)
+    if not len(boxes := boxes_m(room)):
+        return
+    if (limits := recipe.furniture_between_m) is not None:
+        low, high = float(boxes[:, 0, 1].min()), float(boxes[:, 1, 1].max())
+        if low < limits[0] or high > limits[1]:
+            said = f"its furniture reaches from {low:.3f} to {high:.2f} m above the floor"
+            between = f"furniture_between_m is {limits[0]:g} to {limits[1]:g}"
+            yield "furniture_between_m", f"{said}, {between}"
+    outside = outside_floor(room)
+    said = f"{outside} of its {len(boxes)} pieces stand outside of the floor"
+    yield from limited("min_inside_floor", lambda least: 1 - outside / len(boxes) < least, said)
+
+
+def boxes_m(room: Room) -> np.ndarray:
+    """Lower and upper corner of each mesh, (pieces, 2, 3); (0, 2, 3) if no mesh was read."""
+    meshes = [piece.mesh.vertices_m for piece in room.furniture if len(piece.model.vertices_m)]
+    return np.array([(mesh.min(axis=0), mesh.max(axis=0)) for mesh in meshes]).reshape(-1, 2, 3)
+
+
+def outside_floor(room: Room) -> int:
+    """Number of pieces whose centre is not above the floor."""
+    middles = boxes_m(room).mean(axis=1)
+    return int((~shapely.covers(room.floor, shapely.points(middles[:, [0, 2]]))).sum())
+
+
+def unknown_categories(room: Room, recipe: Recipe) -> dict[str, int]:
+    """Number of pieces per category that the recipe does not mention, most frequent first."""
+    pieces = Counter(piece.category for piece in room.furniture if not recipe.knows(piece.category))
+    return dict(pieces.most_common())

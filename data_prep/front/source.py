@@ -24,12 +24,10 @@ from data_prep.engine.source import (
     Survey,
     sentence_of,
 )
-from data_prep.front.drawing import prepare_room
-from data_prep.front.furnished import Room, broken_rule, outside_floor, unknown_categories
+from data_prep.front.furnished import ModelBank, Room
 from data_prep.front.houses import House, house_files, parse_house, read_house
-from data_prep.front.models import ModelBank
-from data_prep.front.recipe import Recipe
-from data_prep.front.viewpoints import view_counts
+from data_prep.front.recipe import Recipe, broken_rule, outside_floor, unknown_categories
+from data_prep.front.views import prepare_room, view_counts
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import file_stamp
 from sceneprior.core.furniture import model_categories, model_info_path
@@ -91,7 +89,13 @@ class FrontSource:
             left_out += lost
         if not found and not left_out:
             kinds = " or ".join(self.recipe.room_types or ("any type",))
-            there = ", ".join(_room_types(files)) or "none that could be read"
+            types: Counter[str] = Counter()
+            for path in files:
+                with contextlib.suppress(InputError):  # the report, if any, has the failure
+                    entries = [room for room in parse_house(path).rooms if isinstance(room, dict)]
+                    types.update(str(entry.get("type") or "?") for entry in entries)
+            said = ", ".join(f"{name} ({count})" for name, count in types.most_common())
+            there = said or "none that could be read"
             raise InputError(
                 f"No room of {self.front} is of a type that {self.recipe.name} selects ({kinds}); "
                 f"the folder has {there}."
@@ -171,16 +175,6 @@ def _parsed(path: Path, stamp: tuple[int, int]) -> House:
     return parse_house(path)
 
 
-def _room_types(files: list[Path]) -> list[str]:
-    """Room types in these houses with their counts, most frequent first."""
-    types: Counter[str] = Counter()
-    for path in files:
-        with contextlib.suppress(InputError):  # the report, if there is one, has the failure
-            entries = [entry for entry in parse_house(path).rooms if isinstance(entry, dict)]
-            types.update(str(entry.get("type") or "?") for entry in entries)
-    return [f"{name} ({count})" for name, count in types.most_common()]
-
-
 def _filtered(room: Room, house: str, recipe: Recipe, rule: str, reason: str) -> Line:
     return Line(
         room.room_id, house, "filtered", rule, reason, notes=[*room.notes],
@@ -193,16 +187,15 @@ def _survey_houses(
 ) -> tuple[list[tuple[str, str, int]], list[Line]]:
     """Read houses; returns (room id, house, views) of the rooms to draw, and the rooms left out."""
     recipe = source.recipe
-
-    def of_type(room_id: str, room_type: str) -> bool:
-        return recipe.of_type(room_type)
-
     found: list[tuple[str, str, int]] = []
     left_out: list[Line] = []
     for path in files:
         house = path.stem
         try:
-            read = read_house(parse_house(path), source.bank, recipe, of_type, load_models=False)
+            read = read_house(
+                parse_house(path), source.bank, recipe, lambda _, kind: recipe.of_type(kind),
+                load_models=False,
+            )  # fmt: skip
         except Exception as error:
             left_out.append(Line(house, house, "failed", reason=sentence_of(error)))
             continue

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from front_files import FrontFolder
 
-from data_prep.front.furnished import Furniture, Room
+from data_prep.front.furnished import Furniture, ModelBank, Room
 from data_prep.front.houses import HouseRooms, read_house
-from data_prep.front.models import ModelBank
 from data_prep.front.recipe import load_recipe
 from sceneprior.core.scene import Mesh
 

@@ -22,10 +22,9 @@ from pycocotools.mask import encode
 from toy_formats import FORMATS
 
 from data_prep.engine.source import pool
-from data_prep.front.furnished import broken_rule
+from data_prep.front.furnished import ModelBank
 from data_prep.front.houses import read_house
-from data_prep.front.models import ModelBank
-from data_prep.front.recipe import load_recipe
+from data_prep.front.recipe import broken_rule, load_recipe
 from data_prep.readers.posed.reader import Posed
 from sceneprior.core.coco import read_coco
 from sceneprior.core.errors import InputError

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import shapely
 
+from data_prep.front.furnished import ModelBank
 from data_prep.front.houses import read_house
-from data_prep.front.models import ModelBank
 from data_prep.front.recipe import load_recipe
 from sceneprior.apps.rooms import write_scenes
 from sceneprior.core.errors import InputError

@@ -6,8 +6,8 @@ from front_files import bedroom
 from front_reading import only_room
 from golden_values import hold
 
-from data_prep.front.drawing import prepare_room
 from data_prep.front.recipe import load_recipe
+from data_prep.front.views import prepare_room
 from sceneprior.core.cameras import camera_centers
 from sceneprior.core.classes import STUFF
 from sceneprior.core.observations import stuff_size, stuff_step, thinned, thinned_intrinsics

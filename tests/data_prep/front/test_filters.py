@@ -8,8 +8,7 @@ from golden_values import hold
 
 from data_prep.engine.build import build_shards
 from data_prep.engine.report import report_tables
-from data_prep.front.furnished import broken_rule
-from data_prep.front.recipe import load_recipe
+from data_prep.front.recipe import broken_rule, load_recipe
 from sceneprior.core.shards import read_index
 
 BED = {"jid": "bed", "pos": (0.0, 0.0, -1.0)}

@@ -12,9 +12,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from refusals import refused
 
+from data_prep.front.furnished import ModelBank
 from data_prep.front.geometry import floor_of
 from data_prep.front.houses import house_files, read_house
-from data_prep.front.models import ModelBank
 from data_prep.front.recipe import load_recipe
 from sceneprior.core.errors import InputError
 

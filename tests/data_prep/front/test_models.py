@@ -5,8 +5,8 @@ import os
 import pytest
 from refusals import refused
 
-from data_prep.front import models
-from data_prep.front.models import ModelBank
+from data_prep.front import furnished
+from data_prep.front.furnished import ModelBank
 from sceneprior.core.furniture import read_obj
 
 BOX_BYTES = 240  # 8 vertices and 12 faces
@@ -17,11 +17,11 @@ def reads(monkeypatch):
     """The models whose files were read, in order."""
     seen = []
 
-    def noted(path, read=models.read_obj):
+    def noted(path, read=furnished.read_obj):
         seen.append(path.parent.name)
         return read(path)
 
-    monkeypatch.setattr(models, "read_obj", noted)
+    monkeypatch.setattr(furnished, "read_obj", noted)
     return seen
 
 

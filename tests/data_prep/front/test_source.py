@@ -11,8 +11,8 @@ from front_reading import shared_front
 from refusals import refused
 
 from data_prep.engine.source import Survey, pool
+from data_prep.front.furnished import ModelBank
 from data_prep.front.houses import read_house
-from data_prep.front.models import ModelBank
 from data_prep.front.recipe import load_recipe
 from data_prep.front.source import FrontSource
 

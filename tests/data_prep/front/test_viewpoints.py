@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from data_prep.front.furnished import Room
 from data_prep.front.recipe import ViewRules
-from data_prep.front.viewpoints import Viewpoints, camera_pose, intrinsics, sees_enough, view_counts
+from data_prep.front.views import Viewpoints, camera_pose, intrinsics, sees_enough, view_counts
 from sceneprior.core.cameras import camera_centers
 
 RULES = ViewRules()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from front_jobs import bedroom_shards, rooms_of
 
-from data_prep.front.viewpoints import camera_pose
+from data_prep.front.views import camera_pose
 from data_prep.inspection.agreement import (
     MARGIN,
     NEAR_M,

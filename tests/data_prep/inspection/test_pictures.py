@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from front_jobs import bedroom_shards
 
-from data_prep.front.viewpoints import camera_pose
+from data_prep.front.views import camera_pose
 from data_prep.inspection.agreement import NEAR_M, Hull, project_edges
 from data_prep.inspection.pictures import AXES, BACKGROUND, FLOOR, WALL, draw_plan, draw_view
 from sceneprior.core.boxes import BOX_EDGES, box_corners
