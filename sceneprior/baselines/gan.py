@@ -157,7 +157,7 @@ class GanStage(lightning.LightningModule):
             check_finite(undecided + scenes.centers_m.sum() + scenes.sizes_m.sum(), views.room_ids)
             real = observed_maps(views, self.classes)
             kept, chosen = choices(scenes, self.model.completeness_target)
-            faces = self.generator.faces
+            faces = self.generator.shape.faces
             assert faces is not None, "GanModel has meshes"
             fake = rendered_maps(scenes, faces, views, kept, chosen, self.settings.silhouettes)
             counts = (kept.unsqueeze(-1) * chosen).sum(dim=1)

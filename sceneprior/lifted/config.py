@@ -151,8 +151,9 @@ class LiftedConfig(PriorConfig):
         prior, latents = self.build_prior(), self.build_latents(len(rooms))
         assert isinstance(prior.shape, PrototypeDecoder)
         prior.shape.set_prototypes(rooms.find_prototypes(self.model.shape.prototypes))
-        target = self.model.completeness_target
-        return LiftedStage(prior, latents, rooms, self.shape, self.loss, target, self.seed)
+        stage = LiftedStage(self, self.shape, prior, latents)
+        stage.rooms = rooms
+        return stage
 
     def _build_sampler_stage(
         self, stage: SamplerConfig, rooms: SamplerRooms, previous: Path | None

@@ -22,6 +22,7 @@ class LiftedStage(LatentStage):
 
     loss: LiftedLossConfig
     rooms: LiftedDataset
+    """The training rooms, which `LiftedConfig` sets."""
 
     @property
     def looks(self) -> PrototypeDecoder:

@@ -70,5 +70,4 @@ class PaperConfig(PriorConfig):
             prior = before.prior.train()
             latents = nn.Embedding.from_pretrained(before.logits, freeze=False)
         module = LayoutStage if isinstance(stage, LayoutConfig) else ShapeStage
-        target = self.model.completeness_target
-        return module(prior, latents, rooms, stage, self.loss, target, self.seed)
+        return module(self, stage, prior, latents)

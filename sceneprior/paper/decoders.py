@@ -3,7 +3,7 @@ and shape, a template mesh deformed by a point-wise MLP (Eq. 6)."""
 
 from abc import ABC, abstractmethod
 from dataclasses import replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -25,15 +25,6 @@ def mlp(*layers: nn.Module, slope: float = 0.0) -> nn.Sequential:
     """The layers in sequence, with a ReLU between them, or a leaky ReLU if `slope` is not 0."""
     between = nn.LeakyReLU(slope) if slope else nn.ReLU()
     return nn.Sequential(*[part for layer in layers for part in (layer, between)][:-1])
-
-
-class Layout(NamedTuple):
-    """Class l_k, centre c_k, size s_k and completeness p_k of each object; metres, room frame."""
-
-    class_logits: Float[Tensor, "rooms objects classes"]
-    centers_m: Float[Tensor, "rooms objects 3"]
-    sizes_m: Float[Tensor, "rooms objects 3"]
-    completeness_logits: Float[Tensor, "rooms objects"]
 
 
 class JointHead(nn.Sequential):
@@ -118,8 +109,9 @@ class LayoutDecoder(nn.Module):
 
     def forward(
         self, features: Float[Tensor, "rooms objects width"]
-    ) -> tuple[Layout, Float[Tensor, "rooms objects hidden"]]:
-        """The layout, and MLP1's output, which the shape decoder takes as input.
+    ) -> tuple[DecodedScenes, Float[Tensor, "rooms objects hidden"]]:
+        """Class l_k, centre c_k, size s_k and completeness p_k of each object, and MLP1's output,
+        which the shape decoder takes as input.
 
             c'_y = ReLU(y) + s_y / 2                                (Eq. S1)
 
@@ -137,7 +129,7 @@ class LayoutDecoder(nn.Module):
         bottom = above_floor(y) if self.floor_gradient else F.relu(y)
         y = bottom + sizes[..., 1] / 2
         centers = torch.stack([x, y, z], dim=-1)
-        return Layout(logits, centers, sizes, complete[..., 0]), shared
+        return DecodedScenes(logits, centers, sizes, complete[..., 0]), shared
 
 
 class _AboveFloor(torch.autograd.Function):

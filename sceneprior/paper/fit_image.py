@@ -81,7 +81,9 @@ def decode_images(
     false, only meshes are decoded: other shapes are not compared with masks.
     """
     z = trained.prior.latent_space.onto(points)
-    with_shape = trained.stage != "layout" and (with_shapes or trained.prior.faces is not None)
+    with_shape = trained.stage != "layout" and (
+        with_shapes or trained.prior.shape.faces is not None
+    )
     return trained.prior.decode(z, with_shape, wanted=views.is_object)
 
 
@@ -103,7 +105,7 @@ def view_loss(
     boxes = seen_boxes(scenes, views, stage.proxy, stage.box_from)
     losses, matches = layout_losses(scenes, boxes, views, weights, None)
     total = weighted_sum(losses, weights)
-    layout, faces = total.detach(), trained.prior.faces
+    layout, faces = total.detach(), trained.prior.shape.faces
     if not masks or scenes.vertices_m is None or faces is None:
         return ViewLoss(total, layout, torch.zeros_like(total), matches)
     seen = seen_masks(scenes.vertices_m, faces, views, stage)

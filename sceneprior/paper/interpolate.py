@@ -95,17 +95,16 @@ def interpolate(trained: TrainedPrior, start: Point, end: Point, steps: int) -> 
     """
     path = RoomPath(trained, latent_of(trained, start), latent_of(trained, end))
     places = even_places(steps)
-    ends = {"from": _name_of(start), "to": _name_of(end)}
+    ends = {
+        key: point if isinstance(point, str) else getattr(point, "name", None) or "a latent"
+        for key, point in (("from", start), ("to", end))
+    }
     scenes = []
     rooms = path.rooms(places, [f"step_{k:02d}" for k in range(steps)])
     for along, room in zip(places.tolist(), rooms, strict=True):
         extra = {**ends, "along": round(along, 6), "slots": room.predictions}
         scenes.append(replace(room.scene, extra=extra))
     return scenes
-
-
-def _name_of(point: Point) -> str:
-    return point if isinstance(point, str) else getattr(point, "name", None) or "a latent"
 
 
 def mixed_colors(room: DecodedRoom) -> UInt8[np.ndarray, "objects 3"]:

@@ -3,12 +3,12 @@ decodes them, its settings, and the prior as trained."""
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -203,11 +203,6 @@ class ScenePrior(nn.Module):
         self.bevels = ClassBevels(classes)
         self.shape: ShapeModule = config.shape.build(2 * width)
 
-    @property
-    def faces(self) -> Int[Tensor, "faces 3"] | None:
-        """Triangles that all decoded meshes share; None for other shapes."""
-        return self.shape.faces
-
     def forward(
         self, logits: Float[Tensor, "rooms logits"], with_shape: bool = True
     ) -> DecodedScenes:
@@ -236,8 +231,8 @@ class ScenePrior(nn.Module):
             needed = (wanted * numbers).amax(dim=1)
         features = self.decoder(z, count, needed)
         with torch.autocast(z.device.type, enabled=False):
-            layout, shared = self.layout(features.to(z.dtype))
-        scenes = DecodedScenes(**layout._asdict(), bevels=self.bevels(layout.class_logits))
+            scenes, shared = self.layout(features.to(z.dtype))
+        scenes = replace(scenes, bevels=self.bevels(scenes.class_logits))
         return self.shape.add_shapes(scenes, shared, with_shape, wanted)
 
 

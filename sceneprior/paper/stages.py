@@ -1,16 +1,14 @@
 """The paper's two stages: layouts from 2D boxes (Eq. 7), then shapes from masks as well (Eq. 8)."""
 
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar
+from typing import Any
 
 import lightning
 import torch
 from jaxtyping import Float, Int
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
-from torch.utils.data import Dataset
 
-from sceneprior.core.settings import Section
 from sceneprior.core.views import SceneViews
 from sceneprior.paper.losses import layout_losses, mask_loss, seen_masks
 from sceneprior.paper.matching import seen_boxes
@@ -36,36 +34,21 @@ from sceneprior.training.steps import (
 class LatentStage(lightning.LightningModule, ABC):
     """A stage that trains the network, and the latents: one row of logits per training room.
 
-    `loss` holds the weight of each loss by name; `completeness_target` is explained in
-    `ModelConfig`.
+    `config` is the run's, and `stage` its section of this stage.
     """
 
-    trains_shape: ClassVar[bool] = True
-    """True if the loss reaches the shape decoder."""
-
     def __init__(
-        self,
-        prior: ScenePrior,
-        latents: nn.Embedding,
-        rooms: Dataset[Any],
-        stage: LatentStageConfig,
-        loss: Section,
-        completeness_target: str,
-        seed: int,
+        self, config: Any, stage: LatentStageConfig, prior: ScenePrior, latents: nn.Embedding
     ):
         super().__init__()
         # DDP expects a gradient of every parameter that requires one.
         prior.requires_grad_(True)
-        prior.shape.requires_grad_(self.trains_shape)
-        prior.bevels.requires_grad_(self.trains_bevels(stage))
-        self.prior, self.latents, self.rooms = prior, latents, rooms
-        self.stage, self.loss, self.seed = stage, loss, seed
-        self.completeness_target = completeness_target
-
-    @staticmethod
-    def trains_bevels(stage: Any) -> bool:
-        """True if the loss uses 2D boxes of beveled boxes."""
-        return False
+        prior.shape.requires_grad_(not isinstance(stage, LayoutConfig))
+        boxes = isinstance(stage, StageConfig) and getattr(stage, "box_from", "proxy") == "proxy"
+        prior.bevels.requires_grad_(boxes and stage.proxy == "beveled_box")
+        self.prior, self.latents, self.stage = prior, latents, stage
+        self.loss, self.seed = config.loss, config.seed
+        self.completeness_target = config.model.completeness_target
 
     @abstractmethod
     def training_step(self, views: Any, batch_idx: int) -> Tensor:
@@ -118,11 +101,6 @@ class LayoutStage(LatentStage):
 
     stage: LayoutConfig
     loss: LossConfig
-    trains_shape = False
-
-    @staticmethod
-    def trains_bevels(stage: Any) -> bool:
-        return bool(stage.proxy == "beveled_box")
 
     def training_step(self, views: SceneViews, batch_idx: int) -> Tensor:
         scenes = self.prior.decode(self.room_latents(views.room_index, batch_idx), False)
@@ -138,10 +116,6 @@ class ShapeStage(LatentStage):
     stage: ShapeConfig
     loss: LossConfig
 
-    @staticmethod
-    def trains_bevels(stage: Any) -> bool:
-        return stage.box_from == "proxy" and stage.proxy == "beveled_box"
-
     def training_step(self, views: SceneViews, batch_idx: int) -> Tensor:
         # In a room of n objects, only the first n predictions are matched and rendered.
         z = self.room_latents(views.room_index, batch_idx)
@@ -151,7 +125,7 @@ class ShapeStage(LatentStage):
             losses, matches = layout_losses(
                 scenes, boxes, views, self.loss, self.completeness_target
             )
-            faces = self.prior.faces
+            faces = self.prior.shape.faces
             assert scenes.vertices_m is not None and faces is not None, "masks are of meshes"
             masks = seen_masks(scenes.vertices_m, faces, views, self.stage)
             losses["mask"], overlap = mask_loss(masks, views, matches, self.loss.iou_gate)

@@ -120,7 +120,7 @@ def test_losses_of_views(paper, images):
     boxes = seen_boxes(scenes, views, stage.proxy, stage.box_from)
     proxies = {name: seen_boxes(scenes, views, name).boxes for name in ("ellipsoid", "beveled_box")}
     losses, matches = layout_losses(scenes, boxes, views, weights, "first_n")
-    masks = seen_masks(scenes.vertices_m, paper.prior.faces, views, stage)
+    masks = seen_masks(scenes.vertices_m, paper.prior.shape.faces, views, stage)
     losses["mask"], overlap = mask_loss(masks, views, matches, 0.0)
     check("view_losses", predictions=matches.prediction, **proxies, **losses, **overlap)
 

@@ -1,9 +1,7 @@
 """The optimiser of the paper's stages: which rate trains what, and when it falls."""
 
 import pytest
-import torch
 from tiny_runs import tiny_config
-from torch.utils.data import Dataset, TensorDataset
 
 from sceneprior.paper.stages import LayoutStage, ShapeStage
 
@@ -13,9 +11,7 @@ def test_adam_has_a_rate_for_each_part_and_all_fall_tenfold_at_the_milestone(tmp
     rates["schedule"] = {"name": "steps", "milestones": [3], "decay": 0.1}
     config = tiny_config(tmp_path, **{f"layout__{key}": value for key, value in rates.items()})
     prior, latents = config.build_prior(), config.build_latents(2)
-    rooms: Dataset = TensorDataset(torch.zeros(2))
-    terms = (config.loss, config.model.completeness_target, 0)
-    stage = LayoutStage(prior, latents, rooms, config.layout, *terms)
+    stage = LayoutStage(config, config.layout, prior, latents)
     of = stage.configure_optimizers()
     groups, schedule = of["optimizer"].param_groups, of["lr_scheduler"]
     seen = []
@@ -31,5 +27,5 @@ def test_adam_has_a_rate_for_each_part_and_all_fall_tenfold_at_the_milestone(tmp
     assert id(latents.weight) in {id(p) for p in groups[2]["params"]}
     assert not trained & shape, "layouts are trained without decoding shapes"
     assert trained | shape >= {id(p) for p in (*prior.decoder.parameters(), latents.weight)}
-    ShapeStage(prior, latents, rooms, config.shape, *terms)
+    ShapeStage(config, config.shape, prior, latents)
     assert all(p.requires_grad for p in prior.shape.parameters())
