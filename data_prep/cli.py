@@ -207,7 +207,7 @@ def prep_posed(
     from data_prep.readers.posed.reader import Posed
 
     source = Posed(
-        rooms, classes=read_label_set(label_set), formats=read_formats(tools or ()), up=up,
+        rooms, classes=read_label_set(label_set), **read_formats(tools or ()), up=up,
         floor_m=floor_m, camera_height_m=camera_height_m, metres_per_unit=metres_per_unit,
         max_side=max_side, tracks=tracks, max_views=max_views, test_share=test_share, seed=seed,
         only=only,

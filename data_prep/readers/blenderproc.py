@@ -25,7 +25,7 @@ from data_prep.engine.plan import digest
 from data_prep.engine.source import RoomTask
 from data_prep.front.recipe import Recipe
 from data_prep.readers.annotations import read_hdf5, read_records
-from data_prep.readers.frames import GL_TO_CV, chosen_frames, sampled
+from data_prep.readers.frames import GL_TO_CV, choose_frames, sampled
 from data_prep.readers.reader import FoundRoom, Reader, by_number
 from data_prep.readers.rooms import FramedRoom, numbered
 from sceneprior.core.checked import plain, shown
@@ -113,12 +113,12 @@ class BlenderProc(Reader):
         """Read the frames of one room; other rooms' furniture, behind doors, is unknown."""
         paths = [self.folder / task.house / name for name in task.extra["frames"]]
         poses = np.stack([_read_pose(path) for path in paths])
-        choice = chosen_frames(task.room_id, poses, range(len(paths)), self.max_views)
+        frames, notes = choose_frames(task.room_id, poses, range(len(paths)), self.max_views)
         categories = _categories(self.folder)
         numbers: dict[str, int] = {}
         classes: dict[int, str] = {}
         images, intrinsics = [], []
-        for frame in choice.frames:
+        for frame in frames:
             image, parts = _read_frame(paths[frame])
             table = np.zeros(int(image.max()) + 1, dtype=np.int32)
             for part in parts:
@@ -135,8 +135,7 @@ class BlenderProc(Reader):
             lines, K = sampled(image.shape, self.max_side, K)
             images.append(table[image[:, ::-1]][lines])
             intrinsics.append(K)
-        mirrored = _FROM_BLENDER @ poses[list(choice.frames)] @ _MIRROR @ GL_TO_CV
-        notes = tuple(choice.notes("image of ids"))
+        mirrored = _FROM_BLENDER @ poses[frames] @ _MIRROR @ GL_TO_CV
         ids = np.stack(images)
         return FramedRoom(
             **numbered(ids, classes, self.label_set, task.room_id, notes=notes),

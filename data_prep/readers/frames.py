@@ -1,7 +1,6 @@
 """Chooses the frames of a recording that become views, and computes their cameras."""
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,86 +22,61 @@ GL_TO_CV = np.diag([1.0, -1, -1, 1])
 """Maps OpenGL's camera axes (y up, z backward) to OpenCV's, and back."""
 
 
-@dataclass(frozen=True)
-class FrameChoice:
-    """The frames that become views, and the number of rejected candidates."""
-
-    frames: tuple[int, ...]
-    candidates: int
-    """Every `step`-th frame of the recording."""
-    bad_poses: int
-    without_mask: int
-    """Candidates with a pose but no mask."""
-    step: int
-
-    def notes(self, mask: str) -> list[str]:
-        """Sentences on the numbers of rejected candidates; `mask` is the name of a missing mask."""
-        of = f"of {self.candidates} frames" + (f" (every {self.step})" if self.step > 1 else "")
-        rejected = {"usable pose": self.bad_poses, mask: self.without_mask}
-        return [
-            f"{count} {of} have no {what}; skipped" for what, count in rejected.items() if count
-        ]
-
-
 def choose_frames(
-    camera_to_world: np.ndarray, with_mask: Collection[int], step: int = 15, at_most: int = 100
-) -> FrameChoice:
-    """Choose every `step`-th usable frame, at most `at_most` of them.
-
-    Frames with a bad pose or without a mask are dropped first, so that a recording that lost
-    tracking keeps as many views as possible. The rest is thinned evenly; the first and the last
-    frame stay. ScanNet's exports have a step of 15, and the paper has 100 views.
-
-    Example: 7 candidates, one lost, thinned to 3.
-
-        >>> poses = np.repeat(np.eye(4)[None], 61, axis=0)
-        >>> poses[10] = -np.inf
-        >>> choose_frames(poses, range(61), step=10, at_most=3)
-        FrameChoice(frames=(0, 40, 60), candidates=7, bad_poses=1, without_mask=0, step=10)
-    """
-    candidates = np.arange(0, len(camera_to_world), step)
-    posed = candidates[is_pose(camera_to_world[candidates])].tolist()
-    masked = set(with_mask)
-    usable = [frame for frame in posed if frame in masked]
-    frames = usable
-    if len(usable) > at_most:
-        # Rounding half up, not to even, keeps the steps as equal as possible.
-        places = np.floor(np.linspace(0, len(usable) - 1, at_most) + 0.5).astype(int)
-        frames = [usable[place] for place in places]
-    return FrameChoice(
-        tuple(frames), len(candidates), len(candidates) - len(posed), len(posed) - len(usable), step
-    )
-
-
-def chosen_frames(
     where: str,
     camera_to_world: np.ndarray,
     with_mask: Collection[int],
     at_most: int,
     step: int = 1,
     mask: str = "image of ids",
+    inside: str = "",
     names: Sequence[str] | None = None,
     hint: str = " Download it again.",
-) -> FrameChoice:
-    """Choose frames (`choose_frames`); an `InputError` if none is usable.
+) -> tuple[list[int], tuple[str, ...]]:
+    """Choose every `step`-th usable frame, at most `at_most` of them, as the views of a room.
 
-    The message begins with `where` and ends with `hint`; `mask` is the name of a missing mask, and
-    `names` are those of the frames, if they have other names than their numbers.
+    Frames with a bad pose or without a mask are dropped first, so that a recording that lost
+    tracking keeps as many views as possible. The rest is thinned evenly; the first and the last
+    frame stay. ScanNet's exports have a step of 15, and the paper has 100 views.
+
+    Args:
+        where: Beginning of the message if no frame is usable; `hint` is its end.
+        mask: Name of a missing mask, and `inside` the place where masks should be.
+        names: Names of the frames, if they have other names than their numbers.
+
+    Returns:
+        Indices of the frames, and sentences on the numbers of rejected ones.
+
+    Example: 7 candidates, one lost, thinned to 3.
+
+        >>> poses = np.repeat(np.eye(4)[None], 61, axis=0)
+        >>> poses[10] = -np.inf
+        >>> choose_frames("a.sens", poses, range(61), at_most=3, step=10)
+        ([0, 40, 60], ('1 of 7 frames (every 10) have no usable pose; skipped',))
     """
-    choice = choose_frames(camera_to_world, with_mask, step, at_most)
-    if choice.frames:
-        return choice
-    bad = np.flatnonzero(~is_pose(camera_to_world[::step])) * step
-    fault = ""
-    if len(bad):
-        frame = bad[0] if names is None else shown(names[bad[0]])
-        fault = f"; frame {frame}: {pose_fault(camera_to_world[bad[0]])}"
+    candidates = np.arange(0, len(camera_to_world), step)
+    good = is_pose(camera_to_world[candidates])
+    bad, posed = candidates[~good], candidates[good].tolist()
+    masked = set(with_mask)
+    frames = [frame for frame in posed if frame in masked]
+    unmasked = len(posed) - len(frames)
     every = f" (every {step})" if step > 1 else ""
-    raise InputError(
-        f"{where} has no usable frame: {choice.bad_poses} of {choice.candidates}{every} have no "
-        f"usable pose (a rotation with a translation), {choice.without_mask} no {mask}{fault}."
-        f"{hint}"
-    )
+    if not frames:
+        fault = ""
+        if len(bad):
+            frame = bad[0] if names is None else shown(names[bad[0]])
+            fault = f"; frame {frame}: {pose_fault(camera_to_world[bad[0]])}"
+        raise InputError(
+            f"{where} has no usable frame: {len(bad)} of {len(candidates)}{every} have no usable "
+            f"pose (a rotation with a translation), {unmasked} no {mask}{inside}{fault}.{hint}"
+        )
+    if len(frames) > at_most:
+        # Rounding half up, not to even, keeps the steps as equal as possible.
+        places = np.floor(np.linspace(0, len(frames) - 1, at_most) + 0.5).astype(int)
+        frames = [frames[place] for place in places]
+    rejected = ((len(bad), "usable pose"), (unmasked, mask))
+    of = f"of {len(candidates)} frames{every}"
+    return frames, tuple(f"{n} {of} have no {what}; skipped" for n, what in rejected if n)
 
 
 def is_pose(camera_to_world: np.ndarray) -> np.ndarray:
@@ -145,23 +119,16 @@ def pose_fault(camera_to_world: np.ndarray) -> str:
     return "its axes are no rotation"
 
 
-def room_cameras(
-    camera_to_world: np.ndarray, room_from_world: np.ndarray | None = None
-) -> np.ndarray:
-    """World-to-camera transforms in the room frame, float64, of good poses with OpenCV axes.
+def room_cameras(camera_to_world: np.ndarray) -> np.ndarray:
+    """World-to-camera transforms, float64, of good poses with OpenCV axes.
 
     The rotation is the nearest exact one, so that a camera's centre and its rays agree to rounding.
-    Without `room_from_world`, the room frame is the world.
     """
     poses = camera_to_world.astype(np.float64)
-    if room_from_world is not None:
-        poses = np.asarray(room_from_world, dtype=np.float64) @ poses
     u, _, v = np.linalg.svd(poses[:, :3, :3])
     turn = (u @ v).transpose(0, 2, 1)
-    inverse = np.zeros_like(poses)
-    inverse[:, :3, :3] = turn
-    inverse[:, :3, 3:] = -turn @ poses[:, :3, 3:]
-    inverse[:, 3, 3] = 1
+    inverse = np.tile(np.eye(4), (len(poses), 1, 1))
+    inverse[:, :3, :3], inverse[:, :3, 3:] = turn, -turn @ poses[:, :3, 3:]
     return inverse
 
 

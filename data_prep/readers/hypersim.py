@@ -23,7 +23,7 @@ from scipy.linalg import rq
 
 from data_prep.engine.source import RoomTask
 from data_prep.readers.annotations import ids_and_classes, read_hdf5, read_records
-from data_prep.readers.frames import GL_TO_CV, Y_UP, chosen_frames, sampled
+from data_prep.readers.frames import GL_TO_CV, Y_UP, choose_frames, sampled
 from data_prep.readers.reader import FoundRoom, Reader
 from data_prep.readers.rooms import FramedRoom, corners_of, numbered
 from sceneprior.core.checked import plain
@@ -62,21 +62,19 @@ class Hypersim(Reader):
         unit = _metres_per_unit(scene / "_detail" / "metadata_scene.csv")
         images, poses = _trajectories(scene, unit)
         with_ids = [k for k, paths in enumerate(images) if all(path.is_file() for path in paths)]
-        choice = chosen_frames(str(scene), poses, with_ids, self.max_views)
+        frames, notes = choose_frames(str(scene), poses, with_ids, self.max_views)
         lines, inside = straight_grid(sampled(size, self.max_side, intrinsics)[0], intrinsics, size)
         intrinsics[0, 1] = 0
         intrinsics = sampled(size, self.max_side, intrinsics)[1]
         arrays = [
-            [np.where(inside, _image(path, size)[lines], -1) for path in images[k]]
-            for k in choice.frames
+            [np.where(inside, _image(path, size)[lines], -1) for path in images[k]] for k in frames
         ]
         instances, semantics = (np.stack(kind) for kind in zip(*arrays, strict=True))
         del arrays
         ids, classes, stuff = ids_and_classes(instances, semantics, str(scene))
-        cameras = Y_UP @ poses[list(choice.frames)] @ GL_TO_CV
+        cameras = Y_UP @ poses[frames] @ GL_TO_CV
         cameras[:, :3, :3] = cameras[:, :3, :3] @ tilt.T
         boxes = _boxes(scene / "_detail" / "mesh", unit)
-        notes = tuple(choice.notes("image of ids"))
         return FramedRoom(
             **numbered(ids, classes, self.label_set, task.room_id, boxes, stuff, notes),
             camera_to_world=cameras,

@@ -19,7 +19,7 @@ from data_prep.engine.source import Line, RoomTask
 from data_prep.readers.annotations import LABEL_SET, Labels, read_labels, unreadable
 from data_prep.readers.frames import (
     Y_UP,
-    chosen_frames,
+    choose_frames,
     is_pose,
     mask_intrinsics,
     pose_fault,
@@ -198,12 +198,12 @@ class ScanNet(Reader):
         sens = read_sens(sens_path)
         images, stuff, unlisted = [], [], set[int]()
         with open_masks(mask_path) as masks:
-            choice = chosen_frames(
+            frames, rejected = choose_frames(
                 str(sens_path), sens.camera_to_world, masks.frames, self.max_views,
-                self.frame_step, f"mask in {mask_path.name}",
+                self.frame_step, "mask", f" in {mask_path.name}",
                 hint=" Download the scan again, or leave it out.",
             )  # fmt: skip
-            notes += choice.notes("mask")
+            notes += rejected
             try:
                 intrinsics = mask_intrinsics(
                     sens.intrinsics, sens.color_size, masks.image_size, self.image_size
@@ -212,7 +212,7 @@ class ScanNet(Reader):
                 raise InputError(f"{mask_path}: {error}") from None
             sizes = zip(masks.image_size, self.image_size, strict=True)
             lines = np.ix_(*(sampled_lines(*size) for size in sizes))
-            for frame in choice.frames:
+            for frame in frames:
                 values = masks.read(frame)[lines]
                 images.append(table[values])
                 stuff.append(stuff_table[thinned_stuff(values)])
@@ -220,8 +220,7 @@ class ScanNet(Reader):
         if unlisted:
             listed = ", ".join(str(value - 1) for value in sorted(unlisted))
             notes.append(f"masks show objects that the aggregation does not have ({listed}): void")
-        poses = sens.camera_to_world[list(choice.frames)]
-        return poses, intrinsics, np.stack(images), np.stack(stuff)
+        return sens.camera_to_world[frames], intrinsics, np.stack(images), np.stack(stuff)
 
     def _mask_path(self, scan: Path) -> Path:
         paths = {name: scan / f"{scan.name}{ending}" for name, ending in MASK_FILES.items()}

@@ -25,7 +25,7 @@ from pydantic import BaseModel, Field, RootModel
 from data_prep.engine.plan import digest
 from data_prep.engine.source import RoomTask
 from data_prep.readers.annotations import LABEL_SET, LIKE_NYU40, TABLE, Labels, read_labels
-from data_prep.readers.frames import GL_TO_CV, Y_UP, chosen_frames, shrunk
+from data_prep.readers.frames import GL_TO_CV, Y_UP, choose_frames, shrunk
 from data_prep.readers.posed.captures import read_model
 from data_prep.readers.posed.recording import PosedFrame, frame_intrinsics
 from data_prep.readers.posed.transforms import FILE_NAME, read_recording
@@ -78,8 +78,7 @@ class ScanNetPP(Reader):
         """Draw the ids of all views; unannotated surfaces, and holes of the mesh, are unknown."""
         scene = self.folder / task.house
         poses, intrinsics, size = _cameras(scene)
-        choice = chosen_frames(str(scene), poses, range(len(poses)), self.max_views)
-        frames = list(choice.frames)
+        frames, notes = choose_frames(str(scene), poses, range(len(poses)), self.max_views)
         scan = read_annotated_mesh(
             scene / _MESH,
             scene / "scans/segments.json",
@@ -120,9 +119,10 @@ class ScanNetPP(Reader):
             ]
             or [np.zeros(0)]
         )
-        notes = (*scan.notes, *choice.notes("image of ids"))
         return FramedRoom(
-            **numbered(ids, classes, self.label_set, task.room_id, points, stuff, notes),
+            **numbered(
+                ids, classes, self.label_set, task.room_id, points, stuff, (*scan.notes, *notes)
+            ),
             camera_to_world=cameras,
             intrinsics=lenses,
             floor_y=float(np.median(heights)) if len(heights) else None,

@@ -23,7 +23,7 @@ from pydantic import BaseModel, RootModel
 
 from data_prep.engine.source import RoomTask
 from data_prep.readers.annotations import ids_and_classes
-from data_prep.readers.frames import Y_UP, chosen_frames, sampled
+from data_prep.readers.frames import Y_UP, choose_frames, sampled
 from data_prep.readers.reader import FoundRoom, Reader, by_number
 from data_prep.readers.rooms import FramedRoom, corners_of, numbered
 from sceneprior.core.cameras import odd_field_of_view
@@ -104,12 +104,12 @@ class Structured3D(Reader):
         views = _views(room)
         cameras = [_read_camera(view / "camera_pose.txt") for view in views]
         poses = np.stack([pose for pose, _ in cameras])
-        choice = chosen_frames(str(room), poses, range(len(views)), self.max_views)
+        frames, notes = choose_frames(str(room), poses, range(len(views)), self.max_views)
         instances: list[np.ndarray] = []
         semantics: list[np.ndarray] = []
         intrinsics = []
         size = mask_size(views[0] / "instance.png")
-        for k in choice.frames:
+        for k in frames:
             half = np.array(size[::-1]) / 2
             K = np.diag([*(half / np.tan(cameras[k][1])), 1.0])
             K[:2, 2] = half
@@ -129,10 +129,10 @@ class Structured3D(Reader):
         numbers[numbers == _NONE] = -1
         ids, classes, stuff = ids_and_classes(numbers, np.stack(semantics), str(room))
         floor_m, ceiling_y, floor_y = _read_floor(scene / "annotation_3d.json", room.name)
-        boxes, notes = _read_boxes(scene / "bbox_3d.json"), tuple(choice.notes("image of ids"))
+        boxes = _read_boxes(scene / "bbox_3d.json")
         return FramedRoom(
             **numbered(ids, classes, self.label_set, task.room_id, boxes, stuff, notes),
-            camera_to_world=Y_UP @ poses[list(choice.frames)],
+            camera_to_world=Y_UP @ poses[frames],
             intrinsics=np.stack(intrinsics),
             floor_y=floor_y,
             floor_m=floor_m,

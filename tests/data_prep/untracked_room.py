@@ -42,6 +42,6 @@ def frames(room: PosedRoom, seed: int = 0):
         ids.append(own)
     height, width = room.size
     lens = np.array([[room.focal_px, 0, width / 2], [0, room.focal_px, height / 2], [0, 0, 1]])
-    poses = room_cameras(np.stack(room.poses) @ np.diag([1.0, -1, -1, 1]), np.eye(4))
+    poses = room_cameras(np.stack(room.poses) @ np.diag([1.0, -1, -1, 1]))
     masks = FrameMasks(np.stack(ids), np.array(classes))
     return masks, np.array(true), poses, np.broadcast_to(lens, (len(ids), 3, 3))

@@ -1,10 +1,7 @@
 """Parses `--from` and `--label-set`; guesses the tools that wrote a room's poses and masks."""
 
-import contextlib
 import json
-from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 
 from data_prep.readers.posed.coco import CocoMasks, PanopticPngs
@@ -15,7 +12,7 @@ from data_prep.readers.posed.segmenters import (
     IdPngs,
     ObjectFolders,
 )
-from data_prep.readers.posed.transforms import POSES, pose_files
+from data_prep.readers.posed.transforms import POSES
 from sceneprior.core.checked import shown
 from sceneprior.core.classes import LABEL_SETS, label_set_name
 from sceneprior.core.errors import InputError
@@ -32,58 +29,30 @@ def mask_files(folder: Path) -> list[Path]:
     return sorted({path for masks in _MASKS for path in masks.find(folder)})
 
 
-@dataclass(frozen=True)
-class Formats:
-    """The formats given with `--from`; a format that is None is guessed for each room."""
-
-    poses: str | None = None
-    masks: str | None = None
-
-    def masks_of(self, folder: Path, label_set_name: str) -> MaskFormat:
-        """The masks of a room. If no masks are found, `IdPngs` is returned, whose error message
-        asks the user for PNGs of ids."""
-        return self._mask_format(folder)(folder, label_set_name)
-
-    def _mask_format(self, folder: Path) -> type[MaskFormat]:
-        found = [masks for masks in _MASKS if masks.find(folder)]
-        if self.masks is not None:
-            named = [masks for masks in _MASKS if masks.name == self.masks]
-            chosen = [masks for masks in named if masks in found]
-            if not chosen and self.masks != IdPngs.name:
-                raise InputError(
-                    f"{folder} has no masks of {named[0].title}; leave out --from {self.masks} to "
-                    "guess."
-                )
-            return (chosen or named)[0]
-        if PanopticPngs in found and IdPngs in found:
-            found.remove(IdPngs)
-        if len(found) > 1:
+def mask_format(folder: Path, given: str | None) -> type[MaskFormat]:
+    """Format of a room's masks, guessed unless it is given. If no masks are found, it is `IdPngs`,
+    whose error message asks the user for PNGs of ids."""
+    found = [masks for masks in _MASKS if masks.find(folder)]
+    if given is not None:
+        named = [masks for masks in _MASKS if masks.name == given]
+        chosen = [masks for masks in named if masks in found]
+        if not chosen and given != IdPngs.name:
             raise InputError(
-                f"{folder} has masks of {' and of '.join(masks.title for masks in found)}; choose "
-                f"with --from {' or --from '.join(masks.name for masks in found)}."
+                f"{folder} has no masks of {named[0].title}; leave out --from {given} to guess."
             )
-        return (found or [IdPngs])[0]
-
-    def found(self, rooms: Iterable[Path]) -> list[str]:
-        """Sentences that name the tools of the rooms, if any tool is guessed."""
-        if self.poses and self.masks:
-            return []
-        count: Counter[tuple[str, type[MaskFormat]]] = Counter()
-        for room in rooms:
-            with contextlib.suppress(InputError):  # the report will have the error
-                poses, files = pose_files(room, self.poses)
-                masks = self._mask_format(room)
-                if files:
-                    count[poses, masks] += 1
-        return [
-            f"{number} room{'s' * (number > 1)} with poses of {POSES[poses]} and masks of "
-            f"{masks.title}, as with --from {poses} --from {masks.name}."
-            for (poses, masks), number in count.items()
-        ]
+        return (chosen or named)[0]
+    if PanopticPngs in found and IdPngs in found:
+        found.remove(IdPngs)
+    if len(found) > 1:
+        raise InputError(
+            f"{folder} has masks of {' and of '.join(masks.title for masks in found)}; choose "
+            f"with --from {' or --from '.join(masks.name for masks in found)}."
+        )
+    return (found or [IdPngs])[0]
 
 
-def read_formats(names: Iterable[str]) -> Formats:
-    """Parse the values of `--from`: at most one format of poses and one of masks."""
+def read_formats(names: Iterable[str]) -> dict[str, str]:
+    """Parse the values of `--from`: at most one format of `poses` and one of `masks`."""
     given: dict[str, str] = {}
     for name in names:
         kind = "poses" if name in POSES else "masks"
@@ -97,7 +66,7 @@ def read_formats(names: Iterable[str]) -> Formats:
                 f"--from {given[kind]} and --from {name} are both formats of {kind}; give one of "
                 "them, and one of the other kind."
             )
-    return Formats(**given)
+    return given
 
 
 def read_label_set(text: str) -> str:

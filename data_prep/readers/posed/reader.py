@@ -1,8 +1,10 @@
 """Reads the user's own posed pictures with masks (docs/posed_data.md): a folder is a room."""
 
+import contextlib
 import math
+from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -10,8 +12,8 @@ import numpy as np
 
 from data_prep.engine.plan import digest, digest_of_files, seeded_split
 from data_prep.engine.source import Line, RoomTask
-from data_prep.readers.frames import chosen_frames, room_cameras, shrunk
-from data_prep.readers.posed.formats import Formats, mask_files
+from data_prep.readers.frames import choose_frames, room_cameras, shrunk
+from data_prep.readers.posed.formats import mask_files, mask_format
 from data_prep.readers.posed.masks import (
     TABLES,
     FrameMask,
@@ -50,8 +52,9 @@ class Posed(Reader):
     classes: str
     """Name of the label set."""
     max_side: int | None = None
-    formats: Formats = field(default_factory=Formats)
-    """The tools that wrote the poses and the masks."""
+    poses: str | None = None
+    masks: str | None = None
+    """Formats of the poses and the masks (`read_formats`); None guesses that of each room."""
     test_share: float = 0.1
     """Share of rooms in the split `test`, which gets at least one of several rooms; 0 puts all
     rooms in `train`."""
@@ -92,7 +95,7 @@ class Posed(Reader):
             )
         names = ("label_set", "up", "floor_m", "camera_height_m", "metres_per_unit", "max_side",
                  "tracks", "max_views")  # fmt: skip
-        formats = {"poses": self.formats.poses, "masks": self.formats.masks}
+        formats = {"poses": self.poses, "masks": self.masks}
         return {"from": formats, **{name: getattr(self, name) for name in names}}
 
     def fingerprint(self, scenes: list[str]) -> dict[str, Any]:
@@ -101,7 +104,7 @@ class Posed(Reader):
         folders = self._folders()
         files = {
             name: digest_of_files(
-                pose_files(room, self.formats.poses)[1]
+                pose_files(room, self.poses)[1]
                 + [room / table for table in TABLES if (room / table).is_file()]
                 + mask_files(room)
             )
@@ -130,14 +133,14 @@ class Posed(Reader):
             raise InputError(f"{self.folder} no longer has this room; restore its folder.")
         recording, masks = self.open(folders[task.house])
         of_frames = masks_of_frames(recording, masks)
-        choice = chosen_frames(
+        chosen, notes = choose_frames(
             str(recording.path),
             np.stack([frame.camera_to_world for frame in recording.frames]),
             of_frames.keys(), self.max_views, mask="mask", hint="",
             names=[frame.name for frame in recording.frames],
         )  # fmt: skip
-        frames = [recording.frames[k] for k in choice.frames]
-        upright, turn = upright_cameras(recording, choice.frames, self.up, self.metres_per_unit)
+        frames = [recording.frames[k] for k in chosen]
+        upright, turn = upright_cameras(recording, chosen, self.up, self.metres_per_unit)
         try:
             size = of_frames[min(of_frames)].size()
             sizes = size, shrunk(size, self.max_side)
@@ -154,7 +157,7 @@ class Posed(Reader):
             camera_to_world=upright,
             intrinsics=made.intrinsics,
             stuff=thinned_stuff(made.stuff),
-            notes=(*choice.notes("mask"), *made.notes),
+            notes=(*notes, *made.notes),
             may_err=True,
             world_from_file=turn,
             poses_file=recording.path.relative_to(recording.folder).as_posix(),
@@ -166,16 +169,29 @@ class Posed(Reader):
 
     def _folders(self) -> dict[str, Path]:
         """Folder of each room by the room's name."""
-        return {room_name(room): room for room in find_rooms(self.folder, self.formats.poses)}
+        return {room_name(room): room for room in find_rooms(self.folder, self.poses)}
 
     def open(self, room: Path) -> tuple[Recording, MaskFormat]:
         """Poses and masks of a room's folder."""
-        recording = read_recording(room, self.formats.poses)
-        return recording, self.formats.masks_of(room, self.label_set)
+        recording = read_recording(room, self.poses)
+        return recording, mask_format(room, self.masks)(room, self.label_set)
 
     def found(self) -> list[str]:
         """Sentences that name the tools whose files were found, for formats that were guessed."""
-        return self.formats.found(self._folders().values())
+        if self.poses and self.masks:
+            return []
+        count: Counter[tuple[str, type[MaskFormat]]] = Counter()
+        for room in self._folders().values():
+            with contextlib.suppress(InputError):  # the report will have the error
+                poses, files = pose_files(room, self.poses)
+                masks = mask_format(room, self.masks)
+                if files:
+                    count[poses, masks] += 1
+        return [
+            f"{number} room{'s' * (number > 1)} with poses of {POSES[poses]} and masks of "
+            f"{masks.title}, as with --from {poses} --from {masks.name}."
+            for (poses, masks), number in count.items()
+        ]
 
     def assumptions(self) -> list[str]:
         """Sentences on values that the files lack and that are assumed, printed first."""

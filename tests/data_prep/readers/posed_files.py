@@ -130,7 +130,7 @@ def prepared(
     room: PosedRoom, label_set: str = SET, tools: Sequence[str] = (), **settings: Any
 ) -> PreparedRoom | None:
     """The room on disk as views; `tools` are values of `--from`."""
-    reader = Posed(room.folder, classes=label_set, formats=read_formats(tools), **settings)
+    reader = Posed(room.folder, classes=label_set, **read_formats(tools), **settings)
     name = room_name(room.folder)
     made = reader.prepare(RoomTask(name, name, "train"), None)
     return made if isinstance(made, PreparedRoom) else None

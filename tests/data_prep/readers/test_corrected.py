@@ -26,7 +26,7 @@ def given(tmp_path_factory):
     room = furnished(tmp_path_factory.mktemp("room"))
     room.size, room.focal_px = (240, 320), 160.0
     images = np.stack([room.ids(view) for view in range(len(room.poses))]).astype(np.uint32)
-    poses = room_cameras(np.stack(room.poses) @ np.diag([1.0, -1, -1, 1]), np.eye(4))
+    poses = room_cameras(np.stack(room.poses) @ np.diag([1.0, -1, -1, 1]))
     lens = np.array([[160.0, 0, 160], [0, 160.0, 120], [0, 0, 1]])
     return images, poses, np.broadcast_to(lens, (len(images), 3, 3))
 

@@ -12,27 +12,19 @@ from data_prep.readers.frames import (
     sampled_lines,
 )
 from data_prep.readers.scannet import FULL_SIZE, QUARTER_SIZE
+from sceneprior.core.cameras import camera_centers
 
 
 def still(count):
     return np.repeat(np.eye(4, dtype=np.float32)[None], count, axis=0)
 
 
-def test_every_fifteenth_frame():
-    choice = choose_frames(still(100), range(100))
-    assert choice.frames == (0, 15, 30, 45, 60, 75, 90) and choice.candidates == 7
-    assert choice.bad_poses == choice.without_mask == 0
-
-
-def test_at_most_a_hundred_evenly():
-    choice = choose_frames(still(15 * 250), range(15 * 250))
-    steps = np.diff(choice.frames) // 15
-    assert len(choice.frames) == 100 and choice.candidates == 250
-    assert choice.frames[0] == 0 and choice.frames[-1] == 15 * 249
-    assert set(steps) == {2, 3}  # 249 steps of 15 in 99
-    assert len(choose_frames(still(1500), range(1500)).frames) == 100
-    assert choose_frames(still(1), [0], at_most=1).frames == (0,)
-    assert choose_frames(still(99), range(99), step=1, at_most=1).frames == (0,)
+def test_at_most_a_hundred_of_every_fifteenth_frame():
+    assert choose_frames("a", still(100), range(100), 100, step=15) == ([*range(0, 100, 15)], ())
+    frames, _ = choose_frames("a", still(15 * 250), range(15 * 250), 100, step=15)
+    assert len(frames) == 100 and frames[0] == 0 and frames[-1] == 15 * 249
+    assert set(np.diff(frames) // 15) == {2, 3}  # 249 steps of 15 in 99
+    assert choose_frames("a", still(99), range(99), at_most=1)[0] == [0]
 
 
 def test_lost_poses_and_missing_masks_are_counted_and_make_room():
@@ -40,9 +32,12 @@ def test_lost_poses_and_missing_masks_are_counted_and_make_room():
     poses[[0, 20]] = -np.inf
     poses[10, 1, 3] = np.nan
     poses[11] = np.inf  # no candidate
-    choice = choose_frames(poses, {5, 15, 25, 30, 35, 40, 45, 50}, step=5, at_most=8)
-    assert choice.frames == (5, 15, 25, 30, 35, 40, 45, 50)
-    assert (choice.candidates, choice.bad_poses, choice.without_mask) == (12, 3, 1)  # 55
+    frames, notes = choose_frames("a", poses, {5, 15, 25, 30, 35, 40, 45, 50}, 8, step=5)
+    assert frames == [5, 15, 25, 30, 35, 40, 45, 50]
+    assert notes == (
+        "3 of 12 frames (every 5) have no usable pose; skipped",
+        "1 of 12 frames (every 5) have no image of ids; skipped",  # 55
+    )
 
 
 def test_what_is_a_pose():
@@ -62,31 +57,21 @@ def test_what_is_a_pose():
     assert is_pose(np.stack([turn, rounded, *bad])).tolist() == [True, True, *[False] * 7]
 
 
-def test_a_room_camera_undoes_pose_and_frame(rng):
-    frame = np.eye(4)
-    frame[:3, :3] = Rotation.random(rng=1).as_matrix()
-    frame[:3, 3] = 4, 5, 6
+def test_room_cameras_are_rigid_inverses_of_poses(rng):
     poses = still(5).astype(np.float64)
     poses[:, :3, :3] = Rotation.random(5, rng=2).as_matrix()
     poses[:, :3, 3] = rng.normal(size=(5, 3))
-    cameras = room_cameras(poses, frame)
     # Double rounding alone: these rotations are exact.
     np.testing.assert_allclose(
-        cameras @ frame @ poses, np.broadcast_to(np.eye(4), (5, 4, 4)), atol=1e-14
+        room_cameras(poses) @ poses, np.broadcast_to(np.eye(4), (5, 4, 4)), atol=1e-14
     )
-    points = rng.normal(size=(3, 7))
-    world = frame[:3, :3] @ (poses[0, :3, :3] @ points + poses[0, :3, 3:]) + frame[:3, 3:]
-    np.testing.assert_allclose(cameras[0, :3, :3] @ world + cameras[0, :3, 3:], points, atol=1e-13)
     # A pose that is off by a rounding is made rigid, its camera left where it stands.
     tilted = poses.copy()
     tilted[:, :3, :3] += rng.normal(scale=1e-3, size=(5, 3, 3))
-    cameras = room_cameras(tilted, frame)
+    cameras = room_cameras(tilted)
     turn = cameras[:, :3, :3]
     np.testing.assert_allclose(turn @ turn.transpose(0, 2, 1), still(5)[:, :3, :3], atol=1e-14)
-    centres = -(turn.transpose(0, 2, 1) @ cameras[:, :3, 3:])[..., 0]
-    np.testing.assert_allclose(
-        centres, tilted[:, :3, 3] @ frame[:3, :3].T + frame[:3, 3], atol=1e-13
-    )
+    np.testing.assert_allclose(camera_centers(cameras), tilted[:, :3, 3], atol=1e-13)
 
 
 K = np.array([[1170.0, 0.5, 640.75], [0, 1165, 491.25], [0, 0, 1]])

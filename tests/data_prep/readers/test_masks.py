@@ -11,7 +11,7 @@ from PIL import Image
 from posed_files import SET, PosedRoom, furniture, prepared
 from refusals import refused
 
-from data_prep.readers.posed.formats import MASKS, Formats, read_formats, read_label_set
+from data_prep.readers.posed.formats import MASKS, read_formats, read_label_set
 from data_prep.readers.posed.masks import find_table
 from data_prep.readers.posed.reader import Posed
 from data_prep.readers.posed.transforms import POSES, read_recording
@@ -195,7 +195,7 @@ def test_what_was_found_is_said(room, cli, tmp_path):
         "as with --from nerfstudio --from png.",
     ]
     both = read_formats(["png", "nerfstudio"])
-    assert Posed(other.folder, classes=SET, formats=both).found() == []
+    assert Posed(other.folder, classes=SET, **both).found() == []
     # A room without the masks that were asked for is in the report, and the other is prepared.
     result = cli("prep-posed", room.folder.parent, "--label-set", SET, "--test-share", 0,
                  "--from", "sam2", "--out", tmp_path / "b", "--workers", 1)  # fmt: skip
@@ -204,9 +204,9 @@ def test_what_was_found_is_said(room, cli, tmp_path):
 
 
 def test_names_of_tools():
-    assert read_formats([]) == read_formats(()) == Formats()
+    assert read_formats([]) == {}
     for name in (*POSES, *MASKS):
-        assert name in vars(read_formats([name])).values()
+        assert name in read_formats([name]).values()
 
 
 @pytest.mark.parametrize(

@@ -445,8 +445,8 @@ def test_frames_of_one_name_need_folders_and_ups_need_axes(tmp_path):
         "tracks": {"tracks": "magic"}, "share": {"test_share": 1.0}, "set": {"classes": "kitti"},
     }.items():  # fmt: skip
         told(f"settings | {key}", **changes)
-    told("tools | none of Polycam", formats=read_formats(["polycam"]))
-    told("tools | no masks of SAM 2", formats=read_formats(["sam2"]))
+    told("tools | none of Polycam", poses="polycam")
+    told("tools | no masks of SAM 2", masks="sam2")
     (tmp_path / "attic/007").mkdir()
     image("attic/007/0.png", np.zeros(SIZE))(tmp_path)
     told("tools | two formats of masks")
