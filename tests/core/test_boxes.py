@@ -1,7 +1,5 @@
 """Corners of boxes, rotations, and template meshes."""
 
-import itertools
-
 import numpy as np
 import pytest
 import torch
@@ -9,23 +7,12 @@ from scipy.spatial import ConvexHull
 from torch.testing import assert_close
 
 from sceneprior.core.boxes import (
-    CUBE_CORNERS,
     QUARTERS,
-    box_corners,
     quarter_rotation,
     turn_vectors,
     yaw_rotation,
 )
-from sceneprior.core.proxies import beveled_cube, icosphere, place, to_cube
-
-
-def test_box_corners_are_center_plus_minus_half_a_size():
-    center, size = torch.tensor([1.0, 2, 3]), torch.tensor([0.2, 4, 6])
-    by_hand = [
-        [1 + x * 0.1, 2 + y * 2, 3 + z * 3] for x, y, z in itertools.product((-1, 1), repeat=3)
-    ]
-    assert_close(box_corners(center, size), torch.tensor(by_hand))
-    assert box_corners(torch.zeros(2, 5, 3), torch.ones(2, 5, 3)).shape == (2, 5, 8, 3)
+from sceneprior.core.proxies import beveled_cube
 
 
 def test_a_yaw_turns_z_towards_x():
@@ -52,32 +39,6 @@ def test_vectors_turn_as_their_rotation_says(torch_rng):
         assert torch.equal(turned[quarters], by_matrix)
 
 
-@pytest.mark.parametrize("level", [0, 1, 2, 4])
-def test_icosphere_is_a_closed_unit_sphere_of_known_size(level):
-    vertices, faces = icosphere(level)
-    assert len(faces) == 20 * 4**level
-    assert len(vertices) == 10 * 4**level + 2  # Euler: V - E + F = 2 with E = 3 F / 2
-    assert_close(vertices.norm(dim=-1), torch.ones(len(vertices)), rtol=0, atol=1e-6)
-    edges = torch.cat([faces[:, (0, 1)], faces[:, (1, 2)], faces[:, (2, 0)]])
-    # Closed and consistently wound: each edge is walked once each way.
-    walked = {tuple(edge) for edge in edges.tolist()}
-    assert len(walked) == len(edges)
-    assert all((b, a) in walked for a, b in walked)
-    a, b, c = vertices[faces].unbind(dim=1)
-    outward = (torch.linalg.cross(b - a, c - a) * (a + b + c)).sum(-1)
-    assert (outward > 0).all()
-
-
-@pytest.mark.parametrize("level", [0, 1, 3])
-def test_to_cube_lands_on_the_cube_in_the_same_direction(level):
-    sphere, _ = icosphere(level)
-    cube = to_cube(sphere)
-    assert_close(cube.abs().amax(dim=-1), torch.ones(len(cube)), rtol=0, atol=1e-6)
-    assert_close(cube / cube.norm(dim=-1, keepdim=True), sphere, rtol=0, atol=1e-6)
-    assert_close(cube.amin(dim=0), -torch.ones(3), rtol=0, atol=1e-6)
-    assert_close(cube.amax(dim=0), torch.ones(3), rtol=0, atol=1e-6)
-
-
 @pytest.mark.parametrize(
     "upright, level, volume",
     [
@@ -99,10 +60,3 @@ def test_a_beveled_cube_touches_all_six_sides_and_has_its_volume(upright, level,
 def test_gradients_of_bevels_in_double_precision():
     bevels = torch.tensor([[0.2, 0.7], [0.5, 0.1]], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(beveled_cube, bevels)
-
-
-def test_place_puts_the_unit_cube_into_the_box():
-    centers = torch.tensor([[[1.0, 2, 3], [0, 0.5, 0]]], dtype=torch.float64)
-    sizes = torch.tensor([[[0.2, 4, 6], [1, 1, 2]]], dtype=torch.float64)
-    cube = centers.new_tensor(CUBE_CORNERS).expand(1, 2, 8, 3)
-    assert_close(place(cube, centers, sizes), box_corners(centers, sizes), rtol=0, atol=1e-15)

@@ -1,17 +1,13 @@
 """Label sets, the classes of models, colours, and seeds."""
 
-import numpy as np
 import pytest
 
 import sceneprior
-from sceneprior.apps.config import load_config
-from sceneprior.core.classes import LABEL_SETS, class_colors, label_set, label_set_name
-from sceneprior.core.errors import ConfigError, InputError
+from sceneprior.core.classes import LABEL_SETS, label_set
+from sceneprior.core.errors import InputError
 from sceneprior.core.furniture import class_of_category
 from sceneprior.core.repeatable import LARGEST_SEED, check_seed
 from sceneprior.core.scene import Scene
-from sceneprior.render.appearance import quiet_colors
-from sceneprior.render.topdown import topdown_protocol
 
 
 def test_the_papers_sets():
@@ -20,30 +16,6 @@ def test_the_papers_sets():
         "front3d_dining": 15, "front3d_library": 15, "front3d_kitchen": 9, "front3d_all": 22,
     }  # fmt: skip
     assert all(classes[0] == "void" for classes in LABEL_SETS.values())
-
-
-def test_a_list_of_ones_own_is_its_own_name():
-    name = label_set_name(["bed", "night stand"])
-    assert name == "void,bed,night stand"
-    assert label_set(name) == ("void", "bed", "night stand")
-    assert len(class_colors(len(label_set(name)))) == 3
-    assert topdown_protocol(name).window_m == 12.8
-
-
-@pytest.mark.parametrize("name", LABEL_SETS)
-def test_the_classes_of_a_label_set_differ_quietly(name):
-    colors = quiet_colors(label_set(name)).astype(int)
-    apart = np.abs(colors[:, None] - colors[None]).max(axis=-1)
-    assert apart[~np.eye(len(colors), dtype=bool)].min() >= 12
-    high, low = colors.max(axis=1), colors.min(axis=1)
-    assert ((high - low) <= 0.55 * high).all() and low.min() >= 64 and high.max() <= 240
-
-
-def test_a_class_has_one_colour_in_all_label_sets_and_unknown_names_have_one_too():
-    assert (quiet_colors(["sofa", "desk"])[::-1] == quiet_colors(["desk", "sofa"])).all()
-    piano, harp = quiet_colors(["grand piano", "harp"])
-    assert (piano != harp).any() and (piano == quiet_colors(["void", "grand piano"])[1]).all()
-    assert quiet_colors([]).shape[0] == 0
 
 
 @pytest.mark.parametrize(
@@ -88,8 +60,3 @@ def test_a_seed_is_a_number_of_32_bits(prior):
             prior.complete(empty, 1, seed)
     with pytest.raises(InputError, match=f"The seed is {TWENTY_DIGITS}"):
         prior.latent(f"seed:{TWENTY_DIGITS}")
-
-
-def test_configs_take_no_larger_one():
-    with pytest.raises(ConfigError, match="seed"):
-        load_config("demo.yaml", (f"seed={TWENTY_DIGITS}",))

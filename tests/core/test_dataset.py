@@ -5,17 +5,13 @@ import pickle
 import numpy as np
 import pytest
 import torch
-from references.batches import batch_room_by_room, rooms_with_images, turn_about_up
-from torch.testing import assert_close
+from references.batches import batch_room_by_room, rooms_with_images
 from toy_rooms import make_toy_room, write_shard
 
-from sceneprior.core.boxes import box_corners
-from sceneprior.core.cameras import boxes_of_points
 from sceneprior.core.dataset import BLANK, MaskStore, ViewDataset
 from sceneprior.core.errors import ShardError
 from sceneprior.core.observations import RoomViews
 from sceneprior.core.shards import Shard, list_shards
-from sceneprior.core.views import RoomBoxes
 from sceneprior.training.steps import DrawSampler, make_loader
 
 
@@ -26,17 +22,6 @@ def dataset(shards, **changes) -> ViewDataset:
 @pytest.fixture(scope="module")
 def rooms(toy_shards) -> list[RoomViews]:
     return rooms_with_images(toy_shards, "train")
-
-
-def drawn_views(data: ViewDataset, rooms: list[RoomViews], row: int, epoch: int) -> list[int]:
-    """Indices of the room's views that a draw contains, found by their cameras."""
-    views = data.__getitems__([(row, epoch)])
-    room = rooms[row // data.rotations]
-    known = room.world_to_camera @ turn_about_up(row % data.rotations).T
-    return [
-        int(np.abs(known - pose).sum(axis=(1, 2)).argmin())
-        for pose in views.world_to_camera[0].numpy()
-    ]
 
 
 @pytest.mark.parametrize(
@@ -66,87 +51,6 @@ def test_batches_are_those_made_room_by_room(toy_shards, rooms, changes):
             assert torch.equal(found, torch.from_numpy(expected)), name
             assert found.dtype == torch.from_numpy(expected).dtype, name
         assert views.instance_ids is None or "instance_ids" in by_hand
-
-
-def test_ids_above_255_can_be_compared_with_objects(toy_shards, monkeypatch):
-    """Torch stores uint16, but does not compare it with other integers."""
-    wide = Shard.read_instance_ids
-    monkeypatch.setattr(
-        Shard, "read_instance_ids", lambda *given: wide(*given).astype(np.uint16) + 255
-    )
-    views = dataset(toy_shards, mask_step=4).__getitems__([(2, 0)])
-    assert views.instance_ids.min() == 255 and (~views.known_pixels).all()
-
-
-def test_draws_are_a_function_of_seed_row_and_epoch_alone(toy_shards, rooms):
-    data = dataset(toy_shards, seed=4)
-    first = [drawn_views(data, rooms, row, epoch) for row in range(3) for epoch in range(4)]
-    again = dataset(toy_shards, seed=4)
-    # In another order, in other batches, in another process: the same.
-    backwards = [
-        drawn_views(again, rooms, row, epoch) for row in (2, 1, 0) for epoch in (3, 2, 1, 0)
-    ]
-    assert first == backwards[::-1]
-    in_batch = again.__getitems__([(1, 2), (0, 0), (2, 3)])
-    alone = again.__getitems__([(0, 0)])
-    assert torch.equal(in_batch.world_to_camera[1], alone.world_to_camera[0])
-    assert all(len(set(draw)) == 5 for draw in first)  # without replacement
-    assert len({tuple(draw) for draw in first}) > 8
-    other = dataset(toy_shards, seed=5)
-    assert [
-        drawn_views(other, rooms, row, epoch) for row in range(3) for epoch in range(4)
-    ] != first
-
-
-def test_few_views_are_shown_about_equally_often(toy_shards, rooms):
-    data = dataset(toy_shards, views_per_room=20)
-    draw = drawn_views(data, rooms, 0, 0)
-    counts = np.bincount(draw, minlength=8)
-    assert len(draw) == 20 and counts.min() == 2 and counts.max() == 3
-
-
-@pytest.mark.parametrize(("fraction", "kept"), [(1.0, 8), (0.5, 4), (0.25, 2), (0.01, 1)])
-def test_view_fraction_keeps_the_same_share_of_each_rooms_views(toy_shards, rooms, fraction, kept):
-    data = dataset(toy_shards, view_fraction=fraction)
-    for row in range(4):
-        seen = set().union(*(drawn_views(data, rooms, row, epoch) for epoch in range(30)))
-        assert len(seen) == kept
-    if fraction == 0.5:
-        subsets = {tuple(allowed) for allowed in data._allowed}
-        assert len(subsets) > 6
-
-
-def test_a_turned_room_under_turned_cameras_looks_the_same(toy_shards, rooms):
-    """Rows 4k to 4k + 3 are room k turned by 0, 90, 180, 270 degrees about +y."""
-    data = dataset(toy_shards, rotations=4)
-    assert len(data) == 48
-    assert data.room_ids[:4] == tuple("toy/train_00" + turn for turn in ("", "@90", "@180", "@270"))
-    with Shard(list_shards(toy_shards, "train")[0]) as shard:
-        truth = shard.read_ground_truth(rooms[0].room_id)
-    n = len(rooms[0].object_class)
-    center = torch.from_numpy(truth.centers_m[:n])
-    size = torch.from_numpy(truth.sizes_m[:n])
-    for quarter in range(4):
-        views = data.__getitems__([(quarter, 0)])
-        found = boxes_of_points(
-            box_corners(center, size)[None], views.world_to_camera, views.intrinsics, (72, 96)
-        )
-        plain = [
-            boxes_of_points(
-                box_corners(
-                    torch.from_numpy(truth.centers_m[:n]), torch.from_numpy(truth.sizes_m[:n])
-                )[None],
-                torch.from_numpy(rooms[0].world_to_camera[[view]])[None],
-                views.intrinsics[:, :1],
-                (72, 96),
-            ).boxes[0, 0]
-            for view in drawn_views(data, rooms, quarter, 0)
-        ]
-        # Quarter turns are exact in floats; what is left is the order of sums.
-        assert_close(found.boxes[0], torch.stack(plain), rtol=0, atol=1e-5)
-        # +z turns towards +x: (x, z) -> (z, -x).
-        center = torch.stack([center[:, 2], center[:, 1], -center[:, 0]], dim=1)
-        size = size[:, [2, 1, 0]]
 
 
 @pytest.mark.parametrize(
@@ -269,40 +173,3 @@ def test_few_files_stay_open_and_none_travels_to_a_worker(toy_shards, monkeypatc
     assert not again._shards
     np.testing.assert_array_equal(again.read(0, np.arange(8)), first)
     np.testing.assert_array_equal(again.read(5, np.arange(8)), store.read(5, np.arange(8)))
-
-
-@pytest.fixture
-def boxes(torch_rng) -> RoomBoxes:
-    """Five rooms of 1 to 4 objects."""
-    is_object = torch.arange(4) < torch.tensor([[1], [4], [2], [3], [1]])
-    label = torch.randint(1, 9, (5, 4), generator=torch_rng) * is_object
-    return RoomBoxes(label, is_object, torch.rand(5, 4, 6, generator=torch_rng), tuple("abcde"))
-
-
-def test_batches_are_the_rooms_one_after_the_other(boxes):
-    batches = boxes.split(2)
-    assert [len(batch.is_object) for batch in batches] == [2, 2, 1]
-    for name in ("object_class", "is_object", "boxes_m"):
-        joined = torch.cat([getattr(batch, name) for batch in batches])
-        assert torch.equal(joined, getattr(boxes, name))
-    assert not any(batch.room_ids for batch in batches)
-
-
-def test_slots_are_those_that_are_asked_for(boxes, torch_rng):
-    order = torch.stack([torch.randperm(4, generator=torch_rng)[:3] for _ in range(5)])
-    taken = boxes.take(order)
-    for room in range(5):
-        for place, slot in enumerate(order[room].tolist()):
-            assert taken.object_class[room, place] == boxes.object_class[room, slot]
-            assert taken.is_object[room, place] == boxes.is_object[room, slot]
-            assert torch.equal(taken.boxes_m[room, place], boxes.boxes_m[room, slot])
-    assert taken.room_ids == boxes.room_ids
-
-
-def test_intrinsics_of_another_size_show_the_same_picture(toy_shards):
-    views = ViewDataset(toy_shards, "train", views_per_room=2).__getitems__([(0, 0), (1, 0)])
-    height, width = views.image_size
-    point_m = torch.tensor([0.3, 0.4, 1.7])
-    here = views.intrinsics @ point_m
-    there = views.intrinsics_at(height / 3, width / 4) @ point_m
-    assert_close(there / here, torch.tensor([1 / 4, 1 / 3, 1]).expand(2, 2, 3))

@@ -13,14 +13,6 @@ def paint(height, width, *rectangles):
     return image
 
 
-def test_a_box_ends_at_the_outer_edge_of_its_last_pixel():
-    seen = observe(paint(20, 40, (1, 4, 5, 14, 15))[None], [True])
-    np.testing.assert_array_equal(seen.boxes, np.float32([[[4 / 40, 5 / 20, 14 / 40, 15 / 20]]]))
-    assert seen.visible.tolist() == [[True]] and seen.mask_pixels.tolist() == [[100]]
-    assert seen.instance_ids.dtype == np.uint8
-    assert seen.boxes.dtype == np.float32 and seen.mask_pixels.dtype == np.int32
-
-
 def test_four_pixels_are_too_narrow_and_five_are_not():
     images = np.stack(
         [
@@ -33,17 +25,6 @@ def test_four_pixels_are_too_narrow_and_five_are_not():
     assert seen.mask_pixels.tolist() == [[0, 25], [100, 0]]
     assert (seen.boxes[0, 0] == 0).all() and (seen.boxes[1, 1] == 0).all()
     np.testing.assert_array_equal(seen.instance_ids, images)  # the pixels stay
-
-
-def test_objects_never_visible_are_dropped_and_the_rest_renumbered():
-    images = paint(20, 40, (1, 0, 0, 3, 3), (2, 10, 0, 20, 10), (4, 20, 0, 30, 10))[None]
-    seen = observe(images, [True] * 4)
-    assert seen.tracked.tolist() == [1, 3]
-    assert set(np.unique(seen.instance_ids)) == {0, 1, 2}
-    assert (seen.instance_ids[0, :10, 10:20] == 1).all()
-    assert (seen.instance_ids[0, :10, 20:30] == 2).all()
-    assert (seen.instance_ids[0, :3, :3] == 0).all()
-    assert seen.boxes.shape == (1, 2, 4)
 
 
 def test_void_is_no_object_and_hides_what_is_behind_it():

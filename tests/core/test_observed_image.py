@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from sceneprior.core.errors import InputError
 from sceneprior.core.observations import RoomViews
 from sceneprior.core.shards import Shard, iterate_rooms, list_shards
-from sceneprior.core.views import as_views, image_from_shards, image_of_room, images_of_split
+from sceneprior.core.views import as_views, image_of_room, images_of_split
 
 
 @pytest.fixture(scope="module")
@@ -27,13 +26,6 @@ def test_only_what_the_view_shows_remains(room):
         assert image.object_class[k] == room.object_class[row]
         np.testing.assert_array_equal(image.boxes[k], room.boxes[view, row])
     assert image.instance_ids.max() == len(rows)
-
-
-def test_rooms_are_found_in_either_split(toy_shards):
-    assert image_from_shards(toy_shards, "toy/test_01", 3).room_id == "toy/test_01"
-    assert image_from_shards(toy_shards, "toy/train_07", 3).name == "toy_train_07_view3"
-    with pytest.raises(InputError, match="holds no room 'attic'; it has 16 rooms, such as toy/te"):
-        image_from_shards(toy_shards, "attic", 0)
 
 
 def test_more_views_of_a_room_are_further_ones(toy_shards):

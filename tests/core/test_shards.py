@@ -40,19 +40,6 @@ def test_round_trip(tmp_path):
     assert {room_id for _, room_id in iterate_rooms(tmp_path, "train")} == {"h/1", "h_2"}
 
 
-def test_stuff_is_optional_and_read_with_the_images(tmp_path):
-    rooms = [make_room("a"), with_stuff(make_room("b", 5, 3, (600, 900)))]
-    assert rooms[1].stuff.shape == (5, 150, 225)
-    write_shard(tmp_path / "a.h5", "front3d_bedroom", [(room, None) for room in rooms])
-    with Shard(tmp_path / "a.h5") as shard:
-        assert [shard.has_stuff(name) for name in "ab"] == [False, True]
-        for room in rooms:
-            read = shard.read_room(room.room_id, images=True)
-            assert_same(read, room)
-            assert shard.read_room(room.room_id).stuff is None
-            assert shard.read_checksum(room.room_id) == room_checksum(read, None)
-
-
 @pytest.mark.parametrize("size", [(12, 16), (360, 480), (361, 479), (968, 1296), (324, 250)])
 def test_thinned_pixels_are_where_their_intrinsics_say(size):
     step = stuff_step(size)

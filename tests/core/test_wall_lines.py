@@ -9,7 +9,7 @@ from rooms_of_walls import DOOR, L_SHAPE, shell_room
 
 from sceneprior.core.classes import STUFF
 from sceneprior.core.observations import stuff_step, thinned_intrinsics
-from sceneprior.core.wall_lines import COARSE_M, find_walls, on_floor, seen_floor
+from sceneprior.core.wall_lines import find_walls, seen_floor
 
 EYES = [(-1.0, 0.5), (-1.2, -0.8), (0.9, -0.7)]
 TURNED = [(1.2 * x - 0.5 * z, 0.5 * x + 1.2 * z) for x, z in L_SHAPE]
@@ -43,27 +43,6 @@ def test_walls_may_have_any_direction():
     eyes = [(1.2 * x - 0.5 * z, 0.5 * x + 1.2 * z) for x, z in EYES]
     walls, _ = find_walls(shell_room(TURNED, eyes))
     assert len(walls) >= 6 and distance(ends_of(walls), TURNED) < 0.07
-
-
-def test_points_on_the_floor_project_onto_their_pixels():
-    room = shell_room(L_SHAPE, EYES)
-    rng = np.random.default_rng(0)
-    pixels = rng.uniform((0, 0), room.image_size[::-1], (50, 2))
-    pose, K = room.world_to_camera[1].astype(float), room.intrinsics[1].astype(float)
-    points_m, length_m, towards = on_floor(pixels, pose, K)
-    eye = -pose[:3, :3].T @ pose[:3, 3]
-    below = np.isfinite(length_m)
-    assert 10 < below.sum() < 50
-    for pixel, (x, z), length, way in zip(
-        pixels[below], points_m[below], length_m[below], towards[below], strict=True
-    ):
-        u, v, depth = K @ (pose @ [x, 0, z, 1])[:3]
-        np.testing.assert_allclose([u / depth, v / depth], pixel, atol=1e-3)  # a float32 rotation
-        assert way @ (eye[::2] - (x, z)) == pytest.approx(np.hypot(*(eye[::2] - (x, z))))
-        # A pixel further along the ray's direction on the floor.
-        if length < COARSE_M and abs(pixel[0] - K[0, 2]) < 5:
-            (further,), _, _ = on_floor(pixel[None] - [[0, 0.01]], pose, K)
-            assert np.hypot(*(further - (x, z))) == pytest.approx(0.01 * length, rel=0.3)
 
 
 def test_the_seen_floor_is_where_some_view_shows_floor():

@@ -32,12 +32,6 @@ def test_solids_are_closed_and_stand_where_they_should(solid, low, high):
     np.testing.assert_allclose(solid.bounds, [low, high], atol=1e-12)
 
 
-def test_fitted_parts_fill_the_size_together():
-    parts = solids.fit_to([solids.box(1, 1, 1), solids.box(1, 1, 1, x=2)], (6, 2, 1))
-    np.testing.assert_allclose(parts[0].bounds, [[-3, 0, -0.5], [-1, 2, 0.5]], atol=1e-12)
-    np.testing.assert_allclose(parts[1].bounds, [[1, 0, -0.5], [3, 2, 0.5]], atol=1e-12)
-
-
 def build_from(tables: dict, size_m=(1.0, 2.0, 0.5), style: int = 0):
     parsed = [Table.parse(heading, rows) for heading, rows in tables.items()]
     rng = np.random.default_rng(0)

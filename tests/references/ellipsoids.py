@@ -1,7 +1,5 @@
 """2D boxes of ellipsoids: once from the textbook's dual quadric, once from a cloud of points."""
 
-import math
-
 import torch
 
 
@@ -70,28 +68,3 @@ def boxes_of_quadrics(centers_m, sizes_m, world_to_camera, intrinsics, image_siz
                 meets = x1 < 1 and x2 > 0 and y1 < 1 and y2 > 0
                 in_frustum[room, view, item] = bool(top > near and meets)
     return found, in_frustum
-
-
-def sphere_points(count, dtype=torch.float64):
-    """Fibonacci's spiral: evenly spread points of the unit sphere."""
-    step = torch.arange(count, dtype=dtype) + 0.5
-    z, angle = 1 - 2 * step / count, step * math.pi * (3 - math.sqrt(5))
-    ring = (1 - z * z).sqrt()
-    return torch.stack([ring * angle.cos(), ring * angle.sin(), z], dim=-1)
-
-
-def box_of_cloud(camera, center, half, near, count=200_000):
-    """(x1, y1, x2, y2) in pixels of points of the surface in front and of the cut's edge."""
-    w = sphere_points(count)
-    surface = (center + half * w) @ camera[:, :3].T + camera[:, 3]
-    points = surface[surface[:, 2] >= near]
-    z = camera[2, :3] * half
-    along = (near - camera[2, :3] @ center - camera[2, 3]) / z.norm()
-    if along.abs() <= 1:
-        axes = torch.linalg.svd(z[None])[2]  # the first along z, two perpendicular to it
-        angle = torch.linspace(0, 2 * math.pi, count, dtype=w.dtype)
-        edge = torch.stack([angle.cos(), angle.sin()], dim=-1) * (1 - along**2).sqrt()
-        edge = edge @ axes[1:] + along * z / z.norm()
-        points = torch.cat([points, (center + half * edge) @ camera[:, :3].T + camera[:, 3]])
-    pixels = points[:, :2] / points[:, 2:]
-    return torch.cat([pixels.amin(dim=0), pixels.amax(dim=0)])

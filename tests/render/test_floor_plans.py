@@ -32,15 +32,6 @@ def test_rooms_of_any_size_are_wholly_in_the_picture(away_m):
         assert len(found) and found.min() > 10 and found.max() < PLAN_PX - 10
 
 
-def test_right_is_x_and_down_is_z():
-    floor_m = np.array([[-2, -2], [2, -2], [2, 2], [-2, 2]], float)
-    bed = box("double_bed", (1.0, 0.3, -1.0), (1.0, 0.6, 1.0))
-    picture = floor_plan(Scene("a", BEDROOM, (bed,), floor_m))
-    column, row = drawn(picture, COLORS["double_bed"]).mean(axis=0)
-    scale = PLAN_PX * 0.9 / 4
-    np.testing.assert_allclose((column, row), PLAN_PX / 2 + np.array([1, -1]) * scale, atol=2)
-
-
 def test_floors_walls_and_openings_are_drawn():
     floor_m = np.array([[0, 0], [4, 0], [4, 2], [2, 2], [2, 4], [0, 4]], float)
     door = Opening("door", (4, 0.5), (4, 1.4), 0.0, 2.0)
@@ -63,8 +54,3 @@ def test_each_class_stands_once_in_the_legend():
         (picture[:, PLAN_PX:] == COLORS["chair"]).all(axis=-1).sum() for picture in (one, all_three)
     ]
     assert counts[0] == counts[1] > 100
-
-
-def test_an_empty_room_is_an_empty_plan():
-    picture = floor_plan(Scene("a", BEDROOM))
-    assert (picture[:, :PLAN_PX] == 255).all()

@@ -1,11 +1,8 @@
 """Contact sheets and painted ids, pixel by pixel."""
 
-import io
-
 import numpy as np
-from PIL import Image
 
-from sceneprior.render.appearance import CAPTION_PX, contact_sheet, paint_ids, png_bytes
+from sceneprior.render.appearance import CAPTION_PX, contact_sheet, paint_ids
 
 
 def plain(height, width, value):
@@ -37,11 +34,3 @@ def test_ids_have_their_colours_and_dark_borders():
     picture = paint_ids(ids, np.array([[100, 0, 0], [0, 60, 0]]), (9, 9, 9))
     assert picture[0].tolist() == [[9, 9, 9], [9, 9, 9], [50, 0, 0], [100, 0, 0]]
     assert picture[2].tolist() == [[0, 30, 0]] * 4
-
-
-def test_a_png_gives_the_picture_back():
-    picture = np.random.default_rng(0).integers(0, 256, (5, 7, 3), dtype=np.uint8)
-    for given in (picture, Image.fromarray(picture)):
-        with Image.open(io.BytesIO(png_bytes(given, compress_level=1))) as read:
-            assert read.format == "PNG"
-            np.testing.assert_array_equal(np.asarray(read), picture)

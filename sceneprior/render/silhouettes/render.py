@@ -47,8 +47,7 @@ def render_scene(
     image_size: tuple[int, int],
     *,
     sigma_px2: float | None = None,
-    sigma_ndc: float | None = None,
-    blur_ndc: float | None = None,
+    blur_px2: float | None = None,
     mode: str = "exact",
     compositing: str = "layered",
     drawn: Bool[Tensor, "rooms objects"] | None = None,
@@ -76,10 +75,9 @@ def render_scene(
         intrinsics: Intrinsics in pixels of an image of `image_size`.
         image_size: (height, width) of the masks.
         sigma_px2: Softness of an edge in squared pixels. Larger values blur more, and give more
-            pixels a gradient. None uses `sigma_ndc`.
-        sigma_ndc: Softness in PyTorch3D's squared-NDC units; None uses the paper's 1e-4.
-        blur_ndc: Squared blur radius in squared NDC; None uses the authors' value, log(1 / 1e-4 -
-            1) * sigma, at which the sigmoid is 1e-4.
+            pixels a gradient. None uses the paper's, 1e-4 in squared NDC (`sigma_from_ndc`).
+        blur_px2: Squared blur radius in squared pixels; None uses the authors' value, log(1 / 1e-4
+            - 1) * sigma, at which the sigmoid is 1e-4.
         mode: `exact` or `fast`.
         compositing: Treatment of occlusion. `layered` (alpha compositing) and `paper` give visible
             masks, see `cpu/backend.py`. `alone` draws each object as if there were no others.
@@ -109,25 +107,25 @@ def render_scene(
         >>> scene.front[0, 0, 20, ::4].tolist()
         [-1, -1, -1, -1, 0, 0, 0, -1]
     """
-    _refuse_unknown("mode", mode, MODES)
-    _refuse_unknown("compositing", compositing, COMPOSITING)
-    _refuse_unknown("backend", backend, BACKENDS)
+    for name, value, known in (
+        ("mode", mode, MODES),
+        ("compositing", compositing, COMPOSITING),
+        ("backend", backend, BACKENDS),
+    ):
+        if value not in known:
+            raise ValueError(
+                f"{name} is '{value}'; expected {', '.join(known[:-1])} or {known[-1]}"
+            )
     if min(image_size) < 1:
         raise ValueError(f"image_size is {tuple(image_size)}; both sides must be at least 1")
-    if sigma_px2 is not None and sigma_ndc is not None:
-        raise ValueError("sigma_px2 and sigma_ndc are both given; they say the same in two units")
     if sigma_px2 is None:
-        sigma_ndc = SIGMA_NDC if sigma_ndc is None else sigma_ndc
-        if not sigma_ndc > 0:
-            raise ValueError(f"sigma_ndc is {sigma_ndc}; it must be positive")
-        sigma_px2 = sigma_from_ndc(sigma_ndc, image_size)
+        sigma_px2 = sigma_from_ndc(SIGMA_NDC, image_size)
     if not sigma_px2 > 0:
         raise ValueError(f"sigma_px2 is {sigma_px2}; it must be positive")
-    blur_px2 = math.log(1 / 1e-4 - 1) * sigma_px2
-    if blur_ndc is not None:
-        if not blur_ndc >= 0:
-            raise ValueError(f"blur_ndc is {blur_ndc}; it must not be negative")
-        blur_px2 = sigma_from_ndc(blur_ndc, image_size)
+    if blur_px2 is None:
+        blur_px2 = math.log(1 / 1e-4 - 1) * sigma_px2
+    if not blur_px2 >= 0:
+        raise ValueError(f"blur_px2 is {blur_px2}; it must not be negative")
     finite = torch.isfinite(vertices_m).flatten(2).all(dim=-1)
     if not bool(finite.all()):
         room, item = (~finite).nonzero()[0].tolist()
@@ -157,10 +155,13 @@ def render_scene(
     else:
         projected = project(vertices_m, world_to_camera, intrinsics).flatten(0, 1)
         pixels, depths = projected[..., :2], projected[..., 2]
+    # Imported when needed: the CPU backend compiles, and Triton may not be installed.
+    module = backend if backend == "reference" else f"{backend}.backend"
+    engine = importlib.import_module(f"sceneprior.render.silhouettes.{module}")
     size = (image_size[0], image_size[1])
     settings = Settings(size, sigma_px2, blur_px2, NEAR_FACE_M, mode, compositing)
     drawn = drawn.repeat_interleave(views, dim=0)
-    images = _engine(backend).draw(pixels, depths, faces, drawn, settings)
+    images = engine.draw(pixels, depths, faces, drawn, settings)
     return RenderedScene(*(array.unflatten(0, (rooms, views)) for array in images))
 
 
@@ -176,14 +177,3 @@ def _masks_of(draw: Callable[Arguments, RenderedScene]) -> Callable[Arguments, T
 
 
 render_silhouettes = _masks_of(render_scene)
-
-
-def _engine(backend: str):
-    # Imported when needed: the CPU backend compiles, and Triton may not be installed.
-    name = backend if backend == "reference" else f"{backend}.backend"
-    return importlib.import_module(f"sceneprior.render.silhouettes.{name}")
-
-
-def _refuse_unknown(name: str, value: str, known: tuple[str, ...]) -> None:
-    if value not in known:
-        raise ValueError(f"{name} is '{value}'; expected {', '.join(known[:-1])} or {known[-1]}")

@@ -92,15 +92,6 @@ def test_matches_ray_casting():
     assert index.dtype == np.int32 and depth.dtype == np.float32
 
 
-def test_orthographic_depth_and_place():
-    wall = np.array([[0.0, 0, 1], [1, 0, 2], [1, 1, 2], [0, 1, 1]])
-    faces = np.array([[0, 1, 2], [0, 2, 3]])
-    index, depth = rasterize(wall, faces, IDENTITY, (4.0, 4.0, 2.0, 1.0), (8, 8), perspective=False)
-    assert np.argwhere(index >= 0).min(axis=0).tolist() == [1, 2]
-    assert np.argwhere(index >= 0).max(axis=0).tolist() == [4, 5]
-    np.testing.assert_allclose(depth[1, 2:6], 1 + (np.arange(4) + 0.5) / 4, rtol=1e-6)
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e300])
 def test_broken_vertices_draw_nothing_and_spoil_nothing(bad):
     vertices = np.array([[-1.0, -1, 1], [1, -1, 1], [0, 1, 1], [bad, 0, 1], [0, bad, 1], [0, 0, 0]])
@@ -108,15 +99,3 @@ def test_broken_vertices_draw_nothing_and_spoil_nothing(bad):
     good, _ = rasterize(vertices[:3], faces[:1], IDENTITY, LENS, (16, 16))
     index, _ = rasterize(vertices, faces, IDENTITY, LENS, (16, 16))
     np.testing.assert_array_equal(index[good >= 0], 0)
-
-
-def test_an_empty_mesh_is_an_empty_picture():
-    index, depth = rasterize(np.zeros((0, 3)), np.zeros((0, 3), int), IDENTITY, LENS, (4, 6))
-    assert index.shape == (4, 6) and (index == -1).all() and np.isinf(depth).all()
-
-
-def test_no_crack_where_a_shared_edge_runs_through_pixel_centres():
-    square = np.array([[-1.0, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]]) * [3, 3, 1]
-    faces = np.array([[0, 1, 2], [0, 2, 3]])  # the diagonal meets the centre of every (i, i)
-    index, _ = rasterize(square, faces, IDENTITY, (7.3, 7.3, 8.0, 8.0), (16, 16))
-    assert (index >= 0).all()

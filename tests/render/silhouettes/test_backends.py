@@ -12,14 +12,12 @@ from silhouette_scenes import (
     cast,
     random_scene,
     render_and_grad,
-    seen_ahead,
     sphere_scene,
     triangles,
 )
 from torch.testing import assert_close
 
 from sceneprior.core.cameras import project
-from sceneprior.core.proxies import icosphere
 from sceneprior.render.silhouettes.render import NEAR_FACE_M, render_scene, render_silhouettes
 
 
@@ -66,8 +64,8 @@ def test_objects_before_beside_behind_and_around_the_camera(seed, sigma_px2, how
 
 
 def test_blur_of_another_width_than_sigmas(how):
-    for blur_ndc in (0.0, 0.1):  # 0 and 14.4 px2
-        backends_agree(sphere_scene(), sigma_px2=0.3, blur_ndc=blur_ndc, **how)
+    for blur_px2 in (0.0, 14.4):
+        backends_agree(sphere_scene(), sigma_px2=0.3, blur_px2=blur_px2, **how)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (5, 1), (17, 23), (8, 9)])
@@ -76,26 +74,6 @@ def test_odd_image_sizes_and_one_view(size, how):
     scene = random_scene(3, rooms=1, views=1) | {"image_size": size, "intrinsics": lens[None, None]}
     masks, front, depth_m, _ = backends_agree(scene, sigma_px2=0.7, **how)
     assert masks.shape == (1, 1, 3, *size) and front.shape == depth_m.shape == (1, 1, *size)
-
-
-def test_triangles_smaller_than_a_pixel(how):
-    generator = torch.Generator().manual_seed(0)
-    places = torch.rand(12, 1, 3, generator=generator, dtype=torch.float64) * 2 - 1
-    places[..., 2] += 3
-    shapes = torch.randn(12, 3, 3, generator=generator, dtype=torch.float64) * 0.02
-    masks = backends_agree(triangles(*((places + shapes).tolist())), sigma_px2=0.05, **how)[0]
-    if how["compositing"] == "alone":
-        assert masks.amax() < 0.99 and (masks.flatten(3).amax(-1) > 1e-3).sum() >= 10
-
-
-def test_faces_without_an_area_are_not_drawn(how):
-    scene = triangles(
-        [[0, 0, 2], [1, 0.1, 2], [0.3, 1, 2]], [[-1, 0.2, 2], [0, 0.2, 2], [1, 0.2, 2]]
-    )
-    scene["faces"] = torch.tensor([[0, 1, 2], [0, 0, 1], [2, 2, 2]])
-    masks, front, _, grad = backends_agree(scene, sigma_px2=0.5, **how)
-    assert masks[0, 0, 0].max() > 0.9 and masks[0, 0, 1].max() == 0
-    assert (front == 1).sum() == 0 and grad[0, 1].abs().max() == 0
 
 
 @pytest.mark.parametrize("lacking", ["rooms", "objects", "views", "faces"])
@@ -126,18 +104,6 @@ def test_an_object_not_drawn_is_empty_hides_nothing_and_has_no_gradient(how):
     assert masks[0, 0, 0].max() == 0 and grad[0, 0].abs().max() == 0
     assert_close(masks[0, 0, 1], alone[0, 0, 1], rtol=0, atol=1e-12)
     assert set(front.unique().tolist()) == {-1, 1}
-
-
-def test_vertices_and_faces_that_are_not_contiguous(how):
-    sphere, faces = icosphere(0)
-    scene = seen_ahead(sphere[None] * 0.5 + torch.tensor([0.1, 0.2, 2.0]), faces)
-    plain = render_and_grad(scene, backend="cpu", **how)
-    faces = faces.T.contiguous().T
-    strided = torch.stack([scene["vertices_m"], scene["vertices_m"] * 9], dim=-1)[..., 0]
-    assert not (strided.is_contiguous() or faces.is_contiguous())
-    other = render_and_grad(scene | {"vertices_m": strided, "faces": faces}, backend="cpu", **how)
-    for one, two in zip(plain, other, strict=True):
-        assert torch.equal(one, two)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

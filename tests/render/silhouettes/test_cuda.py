@@ -210,17 +210,6 @@ def check_float32_and_the_same_bits_again(mode):
     assert all(torch.equal(one, other) for one, other in zip(first, again, strict=True))
 
 
-@pytest.mark.parametrize("mode", MODES)
-def check_a_sphere_before_another(mode):
-    scene = spheres(1, [[0.4, 0.1, 2.5], [-0.7, 0.07, 3.2]], 1.0)
-    masks, front, _, gradient = agree(scene, settings(mode, "layered"))
-    assert (front == 0).sum() > 5 and (front == 1).sum() > 5
-    assert (masks.sum(1) > 0.99).sum() > 5
-    # In the fast mode, vertices of the outline alone have a gradient; in the exact mode, all.
-    moved = (gradient[0, 0].abs().sum(-1) > 0).double().mean()
-    assert moved < 0.5 if mode == "fast" else moved == 1
-
-
 def check_a_sphere_whose_halves_lie_1024_faces_apart():
     # A word of bits holds 32 blocks of 32 faces: the second half comes in the next word.
     pixels, depths, faces, drawn = spheres(0, [[0.3, 0.1, 2.5]], 0.9)

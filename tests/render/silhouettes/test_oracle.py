@@ -12,7 +12,7 @@ import pytest
 import torch
 from references.take_pytorch3d_golden import GOLDEN, WHOLE
 
-from sceneprior.render.silhouettes.render import render_scene
+from sceneprior.render.silhouettes.render import render_scene, sigma_from_ndc
 
 whole = pytest.mark.skipif(
     not WHOLE.is_file(), reason=f"no {WHOLE.parent.name}/{WHOLE.name} beside the repository"
@@ -90,8 +90,8 @@ def test_silhouettes_and_gradients_are_pytorch3ds(source, tag, dtype, blur):
             vertices[None, None],
             faces,
             **camera_of(data, view, tag, dtype),
-            sigma_ndc=float(data["sigma"]),
-            blur_ndc=float(data[f"blur_radius_{blur}"]),
+            sigma_px2=sigma_from_ndc(float(data["sigma"]), size_of(tag)),
+            blur_px2=sigma_from_ndc(float(data[f"blur_radius_{blur}"]), size_of(tag)),
             compositing="alone",
         ).masks[0, 0, 0]
         weights = torch.from_numpy(data[f"weights_int8_{tag}"][item, view]).to(dtype) / 64

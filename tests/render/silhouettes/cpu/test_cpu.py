@@ -12,16 +12,11 @@ from silhouette_scenes import (
     MODES,
     one_triangle_over_another,
     random_scene,
-    seen_ahead,
     triangles,
 )
 from torch.testing import assert_close
 
-from sceneprior.core.cameras import project
-from sceneprior.core.proxies import icosphere
-from sceneprior.render.silhouettes.cpu.kernels import in_threads, windows_of
-from sceneprior.render.silhouettes.reference import Settings
-from sceneprior.render.silhouettes.render import NEAR_FACE_M, render_scene, render_silhouettes
+from sceneprior.render.silhouettes.render import render_scene, render_silhouettes
 
 IMAGES, OBJECTS, HEIGHT, WIDTH = 2, 4, 3, 11
 
@@ -99,35 +94,6 @@ def test_a_camera_that_moves_has_a_gradient_in_both_backends(mode):
         assert_close(mine, wanted, rtol=0, atol=1e-9 * float(wanted.abs().max()))
 
 
-def projected(scene: dict) -> tuple[np.ndarray, np.ndarray]:
-    seen = project(scene["vertices_m"], scene["world_to_camera"], scene["intrinsics"])
-    seen = seen.flatten(0, 2)
-    return seen[..., :2].contiguous().numpy(), seen[..., 2].contiguous().numpy()
-
-
-def settings_of(size: tuple[int, int], blur_px2: float) -> Settings:
-    return Settings(size, 0.5, blur_px2, NEAR_FACE_M, "", "")
-
-
-def test_memory_grows_with_visible_pixels_not_with_objects_x_views_x_image():
-    sphere, _ = icosphere(1)
-    small = sphere * 0.2
-    ahead = small + torch.tensor([0.0, 0, 4.0])
-    unseen = [small + torch.tensor(at) for at in ([9.0, 0, 4], [0, -9, 4], [0, 0, -4])]
-    size = (96, 128)
-    one, many = (
-        windows_of(
-            *projected(seen_ahead(torch.stack(meshes), torch.zeros(0, 3).long(), size, 64.0)),
-            np.ones(len(meshes), dtype=bool),
-            settings_of(size, 2.0**2),
-        )
-        for meshes in ([ahead], [ahead, *unseen * 50])
-    )
-    assert many.start[-1] == one.start[-1]  # what nobody sees takes nothing
-    # 64 * 0.4 / 4 = 6.4 px wide, and 2 px to either side; up to two strips more than needed.
-    assert 10 * 16 <= one.start[-1] <= 12 * 24 < 96 * 128 / 40
-
-
 def test_torch_keeps_its_number_of_threads():
     # In a process of its own: Numba starts its pool, which sets torch's threads, once in each.
     code = """
@@ -142,11 +108,3 @@ print(torch.get_num_threads())
     say = [sys.executable, "-c", code]
     said = subprocess.run(say, capture_output=True, text=True, check=True, env=os.environ | threads)
     assert said.stdout == "1\n"
-
-
-def test_an_error_in_a_thread_is_the_callers():
-    def refuse(first: int, last: int) -> None:
-        raise ValueError(f"items {first} to {last}")
-
-    with pytest.raises(ValueError, match="items 0 to"):
-        in_threads(refuse, 20)

@@ -145,7 +145,7 @@ def test_one_large_triangle_is_the_exact_modes():
         deep = fast == 1
         assert deep.sum() > 10 and (exact[deep] > 1 - 1e-4).all()
         torch.testing.assert_close(fast[~deep], exact[~deep], rtol=0, atol=1e-12)
-        wide = {"sigma_px2": 0.8, "blur_ndc": 9.0, "backend": backend}  # 1296 px2: no end
+        wide = {"sigma_px2": 0.8, "blur_px2": 1296.0, "backend": backend}  # no end
         exact, fast = (render_silhouettes(**scene, mode=m, **wide) for m in ("exact", "fast"))
         torch.testing.assert_close(fast, exact, rtol=0, atol=1e-12)
 
