@@ -16,7 +16,6 @@ from sceneprior.core.settings import Section
 from sceneprior.core.shards import list_shards
 from sceneprior.lifted.lifting import ShapeGrid
 from sceneprior.lifted.lifting.dataset import LiftedDataset
-from sceneprior.lifted.losses import LiftedLossConfig
 from sceneprior.lifted.prototype_decoder import PrototypeConfig, PrototypeDecoder
 from sceneprior.lifted.sampler.network import RoomSampler, SamplerConfig
 from sceneprior.lifted.sampler.rooms import SamplerRooms
@@ -34,6 +33,22 @@ SAMPLER = "sampler"
 """Name of the distribution that draws rooms object by object with the sampler, without a latent."""
 FEW_ROOMS = 24
 """Number of training rooms below which training warns: docs/captures.md advises a few dozen."""
+
+
+class LiftedLossConfig(Section):
+    """Weights of the losses against lifted boxes and shapes."""
+
+    class_: float = Field(1.0, ge=0, alias="class")
+    box: float = Field(5.0, ge=0)
+    completeness: float = Field(1.0, ge=0)
+    shape: float = Field(2.0, ge=0)
+    """Weight of the distance between decoded and lifted shapes."""
+    latents: float = Field(0.0, ge=0)
+    """Weight of the sliced Wasserstein distance between the training rooms' logits and N(0, 1),
+    from which the logits of new rooms are sampled; with it, a larger part of the sphere decodes
+    into rooms."""
+    match_box: float = Field(5.0, ge=0)
+    """lambda_B of the matching cost."""
 
 
 class LiftedStageConfig(LatentStageConfig):

@@ -3,8 +3,8 @@
 It replaces the paper's deformed template; such shapes may have legs, holes and thin tops.
 """
 
-from dataclasses import replace
-from typing import ClassVar, NamedTuple
+from dataclasses import dataclass, fields, replace
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -32,7 +32,6 @@ from sceneprior.lifted.prototypes import (
     turn_of,
     turned_extents,
 )
-from sceneprior.lifted.rooms import PosedScenes
 from sceneprior.lifted.shape_morphing import (
     appearances_of,
     blend_parts,
@@ -60,6 +59,26 @@ class PrototypeConfig(ShapeModuleConfig):
     def build(self, features: int) -> "PrototypeDecoder":
         """The module for object features of width `features`, freshly initialised."""
         return PrototypeDecoder(features, self)
+
+
+@dataclass(frozen=True)
+class PosedScenes(DecodedScenes):
+    """Decoded scenes whose shapes are prototypes in poses."""
+
+    shape_codes: Float[Tensor, "rooms objects codes"] | None = None
+    """Predicted shape codes; None if shapes are deformed meshes."""
+    looks: Int[Tensor, "rooms objects"] | None = None
+    """Look of each object, that is, its prototype and pose as one index: prototype * 8 + pose
+    (`lifted/prototypes.py`). None before the shape decoder has run, and if it predicts meshes."""
+    next_looks: Int[Tensor, "rooms objects"] | None = None
+    """Look into which each object changes along a path; None if the room is not on a path."""
+    shares: Float[Tensor, "rooms objects"] | None = None
+    """Share of `next_looks` in each object's shape, at least 0 and less than 1."""
+
+    @classmethod
+    def of(cls, scenes: DecodedScenes, **shapes: Any) -> "PosedScenes":
+        """Decoded scenes with these shapes."""
+        return cls(**{each.name: getattr(scenes, each.name) for each in fields(scenes)} | shapes)
 
 
 class Posed(NamedTuple):
@@ -118,7 +137,6 @@ class PrototypeDecoder(ShapeModule):
         self.register_buffer("common", torch.zeros(most, dtype=torch.bool))
         self.register_buffer("look_codes", torch.zeros(most * POSES, config.codes))
         self.register_buffer("spread", torch.ones(()))
-        self._meshes: dict[int, Mesh] = {}
         self._shapes: dict[int, Posed] = {}
         self._matched: dict[tuple[int, int], tuple[Parts, Parts]] = {}
 
@@ -143,14 +161,14 @@ class PrototypeDecoder(ShapeModule):
     @property
     def prototypes(self) -> Prototypes:
         """The prototypes set by `set_prototypes`."""
-        rows = self.known
         sizes_m, labels, common = (
-            part[rows].cpu().numpy() for part in (self.sizes_m, self.object_class, self.common)
+            part[self.known].cpu().numpy()
+            for part in (self.sizes_m, self.object_class, self.common)
         )
-        parts = tuple(map(self.parts, rows))
+        parts = tuple(map(self.parts, self.known))
         grids = np.zeros((len(parts), *(self.cells,) * 3), bool)
-        for grid, each in zip(grids, parts, strict=True):
-            grid[...] = filled_cells(each, self.cells, self.margin)
+        for row, each in enumerate(parts):
+            grids[row] = filled_cells(each, self.cells, self.margin)
         return Prototypes(parts, grids, sizes_m.astype(np.float64), labels, common)
 
     def parts(self, prototype: int) -> Parts:
@@ -209,31 +227,25 @@ class PrototypeDecoder(ShapeModule):
         return replace(rooms, looks=looks, next_looks=next_looks, shares=shares)
 
     def mesh_of(self, decoded: DecodedScenes, room: int, item: int) -> Mesh | None:
-        if not isinstance(decoded, PosedScenes) or decoded.looks is None:
-            return None
-        box_m, blend = _box_m(decoded, room, item), self._blend(decoded, room, item)
-        if blend is None:
-            return self.mesh(int(decoded.looks[room, item]), box_m)
-        vertices, faces = surface_of_parts(blend)
-        return Mesh(vertices * box_m[3:] + box_m[:3], faces)
+        shape = self._shape_of(decoded, room, item)
+        return None if shape is None else self.mesh(shape, _box_m(decoded, room, item))
 
     def solids_of(self, decoded: DecodedScenes, room: int, item: int) -> tuple[Solid, ...]:
-        if not isinstance(decoded, PosedScenes) or decoded.looks is None:
-            return ()
-        box_m, blend = _box_m(decoded, room, item), self._blend(decoded, room, item)
-        if blend is None:
-            return self.solids(int(decoded.looks[room, item]), box_m)
-        return _solids_in(blend, box_m)
+        shape = self._shape_of(decoded, room, item)
+        return () if shape is None else self.solids(shape, _box_m(decoded, room, item))
 
-    def _blend(self, decoded: PosedScenes, room: int, item: int) -> Parts | None:
-        """The parts of a shape between two looks, in the frame of its box; None if the prediction
-        has one look."""
-        if decoded.shares is None or not (share := float(decoded.shares[room, item])):
+    def _shape_of(self, decoded: DecodedScenes, room: int, item: int) -> int | Parts | None:
+        """The look of a prediction or, between two looks of a path, the blended parts in the frame
+        of its box; None if no looks are decoded."""
+        if not isinstance(decoded, PosedScenes) or decoded.looks is None:
             return None
-        assert decoded.looks is not None and decoded.next_looks is not None
+        look = int(decoded.looks[room, item])
+        if decoded.shares is None or not (share := float(decoded.shares[room, item])):
+            return look
+        assert decoded.next_looks is not None
         size_m = _box_m(decoded, room, item)[3:]
-        pair = int(decoded.looks[room, item]), int(decoded.next_looks[room, item])
-        own = [self._posed(look) for look in pair]
+        pair = look, int(decoded.next_looks[room, item])
+        own = [self._posed(each) for each in pair]
         if pair not in self._matched:
             self._matched[pair] = matched_parts(*(each.parts for each in own))
         here, there = (
@@ -241,6 +253,47 @@ class PrototypeDecoder(ShapeModule):
             for parts, each in zip(self._matched[pair], own, strict=True)
         )
         return blend_parts(here, there, share)
+
+    def mesh(self, shape: int | Parts, box_m: Float[np.ndarray, "6"]) -> Mesh:
+        """The mesh of a look, stretched into a box (centre, full extents), or of parts in the frame
+        of that box."""
+        if isinstance(shape, Parts):
+            vertices, faces = surface_of_parts(shape)
+        else:
+            own = self._posed(shape)
+            vertices = own.stretch.moved(own.surface.vertices_m, box_m[3:])
+            faces = own.surface.faces
+        return Mesh(vertices * box_m[3:] + box_m[:3], faces)
+
+    def solids(self, shape: int | Parts, box_m: Float[np.ndarray, "6"]) -> tuple[Solid, ...]:
+        """The solids of a look or of parts in a box (centre, full extents), as `mesh` places its
+        surface."""
+        if not isinstance(shape, Parts):
+            own = self._posed(shape)
+            shape = stretched_parts(own.parts, own.stretch, box_m[3:])
+        placed_m = shape.ends.swapaxes(1, 2) * box_m[3:] + box_m[:3]
+        # A part in the middle is its own mirror image, up to rounding.
+        _, first = np.unique(placed_m.round(5), axis=0, return_index=True)
+        low_m, high_m = placed_m.swapaxes(0, 1).tolist()
+        return tuple(
+            Solid(KIND_NAMES[shape.kind[row]], tuple(low_m[row]), tuple(high_m[row]))
+            for row in sorted(first)
+        )
+
+    def _posed(self, look: int) -> Posed:
+        """The shape of a look; computed once."""
+        if look not in self._shapes:
+            prototype, pose = divmod(look, POSES)
+            parts = self.parts(prototype)
+            surface = self._posed(look - pose).surface if pose else Mesh(*surface_of_parts(parts))
+            vertices = surface.vertices_m @ pose_rotation(pose).T
+            # Mirroring inverts the faces: reverse their corners.
+            faces = surface.faces[:, ::-1].copy() if turn_of(pose)[1] else surface.faces
+            size_m = self.sizes_m[prototype].double().cpu().numpy()
+            posed = posed_parts(parts, pose)
+            stretch = Stretch.of(posed, turned_extents(size_m[None], pose)[0])
+            self._shapes[look] = Posed(posed, Mesh(vertices, faces), stretch)
+        return self._shapes[look]
 
     def looks(self, codes: Float[Tensor, "*objects codes"]) -> Int[Tensor, "*objects"]:
         """The look whose code is nearest, in a tie the first; 0 before prototypes are set."""
@@ -258,59 +311,15 @@ class PrototypeDecoder(ShapeModule):
         """Codes of looks, and the number of cells that each fills."""
         return self.look_codes[looks], self.filled[looks // POSES]
 
-    def mesh(self, look: int, box_m: Float[np.ndarray, "6"]) -> Mesh:
-        """The mesh of a look, stretched into a box (centre, full extents)."""
-        own = self._posed(look)
-        vertices = own.stretch.moved(own.surface.vertices_m, box_m[3:])
-        return Mesh(vertices * box_m[3:] + box_m[:3], own.surface.faces)
-
-    def solids(self, look: int, box_m: Float[np.ndarray, "6"]) -> tuple[Solid, ...]:
-        """The solids of a look in a box (centre, full extents), as `mesh` places its surface."""
-        own = self._posed(look)
-        return _solids_in(stretched_parts(own.parts, own.stretch, box_m[3:]), box_m)
-
-    def _posed(self, look: int) -> Posed:
-        """The shape of a look; computed once."""
-        if look not in self._shapes:
-            prototype, pose = divmod(look, POSES)
-            parts = self.parts(prototype)
-            size_m = self.sizes_m[prototype].double().cpu().numpy()
-            surface, (_, mirrored) = self.surface(prototype), turn_of(pose)
-            vertices = surface.vertices_m @ pose_rotation(pose).T
-            # Mirroring inverts the faces: reverse their corners.
-            faces = surface.faces[:, ::-1].copy() if mirrored else surface.faces
-            own_m = turned_extents(size_m[None], pose)[0]
-            posed = posed_parts(parts, pose)
-            self._shapes[look] = Posed(posed, Mesh(vertices, faces), Stretch.of(posed, own_m))
-        return self._shapes[look]
-
     @property
     def known(self) -> list[int]:
         """Indices of the prototypes in use."""
         return (self.object_class != self.unknown).nonzero()[:, 0].tolist()
 
-    def surface(self, prototype: int) -> Mesh:
-        """The surface of a prototype in [-0.5, 0.5]^3; computed once."""
-        if prototype not in self._meshes:
-            self._meshes[prototype] = Mesh(*surface_of_parts(self.parts(prototype)))
-        return self._meshes[prototype]
-
 
 def _box_m(decoded: DecodedScenes, room: int, item: int) -> Float[np.ndarray, "6"]:
     box_m = torch.cat((decoded.centers_m[room, item], decoded.sizes_m[room, item]))
     return np.asarray(box_m.double().cpu().numpy())
-
-
-def _solids_in(parts: Parts, box_m: Float[np.ndarray, "6"]) -> tuple[Solid, ...]:
-    """Parts without mirror images, in the frame of a box (centre, full extents), as solids."""
-    placed_m = parts.ends.swapaxes(1, 2) * box_m[3:] + box_m[:3]
-    # A part in the middle is its own mirror image, up to rounding.
-    _, first = np.unique(placed_m.round(5), axis=0, return_index=True)
-    low_m, high_m = placed_m.swapaxes(0, 1).tolist()
-    return tuple(
-        Solid(KIND_NAMES[parts.kind[row]], tuple(low_m[row]), tuple(high_m[row]))
-        for row in sorted(first)
-    )
 
 
 def _padded(outline: Float[np.ndarray, "corners 2"]) -> Float[Tensor, "most 2"]:

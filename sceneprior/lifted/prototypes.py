@@ -5,6 +5,7 @@ prototype * POSES + pose, where pose p mirrors the prototype (x reversed) if p >
 it about +y by p % 4 quarter turns.
 """
 
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from sceneprior.core.boxes import QUARTERS, quarter_rotation, turn_grids
 from sceneprior.core.parts import Parts
+from sceneprior.core.views import RoomBoxes
 
 POSES = 2 * QUARTERS
 """Poses of a prototype: mirrored or not, times the quarter turns; numbered as in the module's
@@ -61,6 +63,25 @@ class Prototypes(NamedTuple):
             for pose in range(POSES)
         ]  # fmt: skip
         return np.stack(rows, axis=1).reshape(len(self.grids) * POSES, -1).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class PosedRooms(RoomBoxes):
+    """Rooms as boxes with posed prototypes, in the rectangles in which they were furnished."""
+
+    looks: Int[Tensor, "rooms objects"] | None = None
+    """Look of each object, prototype * 8 + pose (`lifted/prototypes.py`); None if unknown."""
+    rectangle_m: Float[Tensor, "rooms 4"] | None = None
+    """Rectangle in which each room was furnished: centre x, z and extents x, z; None if unknown."""
+    walls_m: Float[Tensor, "rooms 4"] | None = None
+    """Distances of the walls near the furniture from the origin, outwards, at low z, low x, high z
+    and high x; NaN where no wall is known. None if no walls are known."""
+
+    def take(self, order: Int[Tensor, "rooms slots"]) -> "PosedRooms":
+        """Gather the slots of each room in the order of the indices `order`."""
+        # Rectangles and walls have no slots.
+        slots = super(PosedRooms, replace(self, rectangle_m=None, walls_m=None)).take(order)
+        return replace(slots, rectangle_m=self.rectangle_m, walls_m=self.walls_m)
 
 
 def choose_prototypes(

@@ -14,7 +14,8 @@ from torch.testing import assert_close
 from sceneprior.core.errors import InputWarning
 from sceneprior.core.views import DecodedScenes
 from sceneprior.lifted.lifting.dataset import LiftedRooms
-from sceneprior.lifted.losses import (
+from sceneprior.lifted.prototype_decoder import PosedScenes
+from sceneprior.lifted.stages import (
     PER_METRE,
     latent_loss,
     lifted_losses,
@@ -22,7 +23,6 @@ from sceneprior.lifted.losses import (
     shape_code_loss,
     sliced_wasserstein,
 )
-from sceneprior.lifted.rooms import PosedScenes
 
 COUNTS = (3, 2, 0)
 

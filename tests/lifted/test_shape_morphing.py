@@ -8,9 +8,8 @@ from parts_of_rooms import CORNER, TABLE
 
 from sceneprior.core.parts import filled_cells
 from sceneprior.core.views import DecodedScenes
-from sceneprior.lifted.prototype_decoder import PrototypeConfig, PrototypeDecoder
+from sceneprior.lifted.prototype_decoder import PosedScenes, PrototypeConfig, PrototypeDecoder
 from sceneprior.lifted.prototypes import Prototypes
-from sceneprior.lifted.rooms import PosedScenes
 from sceneprior.lifted.shape_morphing import appearances_of
 
 STEPS = 129

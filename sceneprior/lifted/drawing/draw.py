@@ -14,11 +14,11 @@ from torch import Tensor
 from sceneprior.core.errors import InputError
 from sceneprior.lifted.drawing.plans import RoomPlans, check_floor, plan_rooms
 from sceneprior.lifted.drawing.steps import NUMBERS, Particles, Rejections, place_next
+from sceneprior.lifted.prototypes import PosedRooms
 from sceneprior.lifted.requests.floors import RoomShape
 from sceneprior.lifted.requests.relations import furniture_in
 from sceneprior.lifted.requests.rules import PlacementRules
 from sceneprior.lifted.requests.wishes import Conditions
-from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.contents import END
 from sceneprior.lifted.sampler.frames import FRAME_M, gaps_m
 from sceneprior.lifted.sampler.network import RoomSampler

@@ -14,10 +14,10 @@ from sceneprior.core.colliders import HUNG
 from sceneprior.core.errors import InputError, InputWarning
 from sceneprior.core.mixtures import draw_index
 from sceneprior.core.shell import rectangle
+from sceneprior.lifted.prototypes import PosedRooms
 from sceneprior.lifted.requests.floors import Floor, RoomShape
 from sceneprior.lifted.requests.openings import place_openings
 from sceneprior.lifted.requests.wishes import Conditions
-from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.contents import END
 from sceneprior.lifted.sampler.frames import rectangle_sides, rectangles_of
 from sceneprior.lifted.sampler.network import EncoderState, RoomSampler

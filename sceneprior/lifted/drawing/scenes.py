@@ -17,11 +17,10 @@ from sceneprior.lifted.config import SAMPLER, TrainedLifted
 from sceneprior.lifted.drawing.draw import SampledRooms, draw_rooms
 from sceneprior.lifted.lifting import HANGS_M
 from sceneprior.lifted.prototype_decoder import PrototypeDecoder
-from sceneprior.lifted.prototypes import POSES
+from sceneprior.lifted.prototypes import POSES, PosedRooms
 from sceneprior.lifted.requests.relations import RelationChecks, furniture_in
 from sceneprior.lifted.requests.request import RoomRequest
 from sceneprior.lifted.requests.wishes import Conditions
-from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.frames import side_of
 from sceneprior.paper.prior import TrainedPrior
 

@@ -19,10 +19,9 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.proxies import beveled_cube, icosphere
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.views import DecodedScenes, ObservedImage
-from sceneprior.lifted.prototype_decoder import PrototypeDecoder
+from sceneprior.lifted.prototype_decoder import PosedScenes, PrototypeDecoder
 from sceneprior.lifted.reconstruction.known_rooms import turn_object
 from sceneprior.lifted.reconstruction.placing import Outlines, Placed, outlines_of, place_objects
-from sceneprior.lifted.rooms import PosedScenes
 from sceneprior.paper.losses import kept_objects
 from sceneprior.paper.prior import ScenePrior, TrainedPrior
 from sceneprior.paper.sampling import scene_of

@@ -31,9 +31,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sceneprior.core.shell import Wall
+from sceneprior.lifted.prototypes import PosedRooms
 from sceneprior.lifted.requests.floors import Floor, RoomShape
 from sceneprior.lifted.requests.wishes import OPENINGS, RelationWish
-from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.frames import side_of
 from sceneprior.lifted.sampler.network import RoomSampler
 

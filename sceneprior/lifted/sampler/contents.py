@@ -8,8 +8,7 @@ from torch.nn import functional as F
 
 from sceneprior.core.boxes import QUARTERS
 from sceneprior.core.mixtures import draw_index
-from sceneprior.lifted.prototypes import POSES
-from sceneprior.lifted.rooms import PosedRooms
+from sceneprior.lifted.prototypes import POSES, PosedRooms
 from sceneprior.lifted.sampler.frames import side_of
 
 END = 0

@@ -14,8 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from sceneprior.core.boxes import QUARTERS, turn_boxes
-from sceneprior.lifted.prototypes import POSES, turn_posed
-from sceneprior.lifted.rooms import PosedRooms
+from sceneprior.lifted.prototypes import POSES, PosedRooms, turn_posed
 
 GRAZE_M = 0.05
 """Overlap along an axis up to which an intersection of lifted boxes is attributed to their

@@ -11,8 +11,7 @@ from torch import Tensor, nn
 
 from sceneprior.core.boxes import QUARTERS
 from sceneprior.core.mixtures import LogisticMixture, draw_index
-from sceneprior.lifted.prototypes import POSES, turn_posed
-from sceneprior.lifted.rooms import PosedRooms
+from sceneprior.lifted.prototypes import POSES, PosedRooms, turn_posed
 from sceneprior.lifted.sampler.contents import Contents, PairwisePotentials
 from sceneprior.lifted.sampler.frames import SYMMETRIES, gaps_m, rectangle_sides
 from sceneprior.lifted.sampler.placement import SHOWN, Placement, Places

@@ -10,8 +10,7 @@ from torch import Tensor, nn
 
 from sceneprior.core.boxes import QUARTERS
 from sceneprior.core.mixtures import FIRST_SCALE, LogisticMixture
-from sceneprior.lifted.prototypes import PARTS, turn_posed
-from sceneprior.lifted.rooms import PosedRooms
+from sceneprior.lifted.prototypes import PARTS, PosedRooms, turn_posed
 from sceneprior.lifted.sampler.frames import (
     gaps_to_sides_m,
     shared_extents,

@@ -19,8 +19,7 @@ from sklearn.mixture import GaussianMixture
 from torch import Tensor
 
 from sceneprior.core.boxes import QUARTERS
-from sceneprior.lifted.prototypes import POSES, Prototypes
-from sceneprior.lifted.rooms import PosedRooms
+from sceneprior.lifted.prototypes import POSES, PosedRooms, Prototypes
 from sceneprior.lifted.sampler.contents import END
 from sceneprior.lifted.sampler.frames import (
     gaps_to_sides_m,

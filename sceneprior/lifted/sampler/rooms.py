@@ -12,8 +12,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from sceneprior.core.wall_lines import Wall
 from sceneprior.lifted.lifting.dataset import LiftedDataset
-from sceneprior.lifted.prototypes import Prototypes
-from sceneprior.lifted.rooms import PosedRooms
+from sceneprior.lifted.prototypes import PosedRooms, Prototypes
 from sceneprior.lifted.sampler.frames import (
     FRAME_M,
     GRAZE_M,

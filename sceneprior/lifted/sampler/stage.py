@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
 
-from sceneprior.lifted.rooms import PosedRooms
+from sceneprior.lifted.prototypes import PosedRooms
 from sceneprior.lifted.sampler.frames import SYMMETRIES, turned_rooms
 from sceneprior.lifted.sampler.network import RoomSampler, SamplerConfig
 from sceneprior.lifted.sampler.rooms import SamplerRooms, frames_of, large_first, shuffled

@@ -10,9 +10,9 @@ from sceneprior.lifted.drawing import draw as module
 from sceneprior.lifted.drawing.draw import PLAIN, SampledRooms, draw_rooms
 from sceneprior.lifted.drawing.plans import BEYOND_M, holding
 from sceneprior.lifted.drawing.steps import INTERSECTING
+from sceneprior.lifted.prototypes import PosedRooms
 from sceneprior.lifted.requests.floors import Floor, read_floor
 from sceneprior.lifted.requests.wishes import Conditions, CountWish, Wishes
-from sceneprior.lifted.rooms import PosedRooms
 from sceneprior.lifted.sampler.frames import gaps_m, rectangles_of, shared_extents
 
 CLASSES = ("void", "sofa", "box", "lamp", "piano")

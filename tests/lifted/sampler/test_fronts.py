@@ -4,8 +4,7 @@ import torch
 
 from sceneprior.core.boxes import QUARTERS, turn_boxes
 from sceneprior.core.parts import whole_box
-from sceneprior.lifted.prototypes import Prototypes, turn_posed
-from sceneprior.lifted.rooms import PosedRooms
+from sceneprior.lifted.prototypes import PosedRooms, Prototypes, turn_posed
 from sceneprior.lifted.sampler.frames import SYMMETRIES, own_sides, side_of, turned_rooms
 from sceneprior.lifted.sampler.prototype_statistics import _gaps_to_furniture, find_sides
 

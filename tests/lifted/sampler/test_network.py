@@ -9,8 +9,7 @@ from rooms_of_boxes import sampler_rooms, small_sampler
 from torch.testing import assert_close
 
 from sceneprior.core.boxes import QUARTERS
-from sceneprior.lifted.prototypes import turn_posed
-from sceneprior.lifted.rooms import PosedRooms
+from sceneprior.lifted.prototypes import PosedRooms, turn_posed
 from sceneprior.lifted.sampler.contents import END
 from sceneprior.lifted.sampler.frames import SYMMETRIES, rectangles_of
 from sceneprior.lifted.sampler.rooms import SamplerRooms, frames_of, large_first, shuffled

@@ -7,8 +7,7 @@ import torch
 from torch.testing import assert_close
 
 from sceneprior.core.boxes import QUARTERS
-from sceneprior.lifted.prototypes import POSES, turn_posed
-from sceneprior.lifted.rooms import PosedRooms
+from sceneprior.lifted.prototypes import POSES, PosedRooms, turn_posed
 from sceneprior.lifted.sampler.contents import MANY, MOST_LOG, PairwisePotentials
 from sceneprior.lifted.sampler.frames import SYMMETRIES, side_of, turned_rooms
 

@@ -5,8 +5,7 @@ import torch
 from torch.testing import assert_close
 
 from sceneprior.core.boxes import QUARTERS, turn_boxes
-from sceneprior.lifted.prototypes import POSES, turn_posed
-from sceneprior.lifted.rooms import PosedRooms
+from sceneprior.lifted.prototypes import POSES, PosedRooms, turn_posed
 from sceneprior.lifted.sampler import placement as module
 from sceneprior.lifted.sampler.frames import turn_places, turn_rectangles
 from sceneprior.lifted.sampler.placement import Placement, Places

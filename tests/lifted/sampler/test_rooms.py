@@ -12,7 +12,7 @@ from torch.testing import assert_close
 from sceneprior.core.boxes import turn_boxes
 from sceneprior.core.wall_lines import Wall
 from sceneprior.lifted.lifting.dataset import LiftedDataset
-from sceneprior.lifted.rooms import PosedRooms
+from sceneprior.lifted.prototypes import PosedRooms
 from sceneprior.lifted.sampler.frames import (
     FRAME_M,
     SYMMETRIES,
