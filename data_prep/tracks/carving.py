@@ -192,21 +192,15 @@ def widened(ids: Int[np.ndarray, "views height width"]) -> Int[np.ndarray, "view
     return wide
 
 
-def first_hits(
-    ids: Int[np.ndarray, "views height width"], cameras: Cameras, grid: Grid
-) -> Float[np.ndarray, "views height width"]:
-    """Depth in metres of the first filled cell along the ray of each mask pixel; inf if there is
-    none."""
-    return _first_hits(ids, cameras.eyes_m, cameras.rays, *grid)
-
-
 def surface(
     ids: Int[np.ndarray, "views height width"],
+    near: Int[np.ndarray, "views height width"],
     cameras: Cameras,
     grid: Grid,
-    depth: Float[np.ndarray, "views height width"],
 ) -> Surface:
-    """Find the cells at the depths of `first_hits`, and the ids that all views show there."""
+    """Find the first filled cells on the rays of masks, and the ids that all views show there;
+    `near` are the ids after `widened`."""
+    depth = first_hits(ids, cameras.eyes_m, cameras.rays, *grid)
     view, row, column = np.nonzero(np.isfinite(depth))
     pixels = np.stack([column + 0.5, row + 0.5, np.ones(len(view))], axis=1)
     directions = (cameras.rays[view] @ pixels[..., None])[..., 0]
@@ -216,19 +210,7 @@ def surface(
     hit = np.zeros_like(grid.filled)
     hit[tuple(at.T)] = True
     cells = np.argwhere(hit & grid.filled)
-    return Surface(cells, ids_at(cells, ids, cameras, grid, depth))
-
-
-def ids_at(
-    cells: Int[np.ndarray, "cells 3"],
-    ids: Int[np.ndarray, "views height width"],
-    cameras: Cameras,
-    grid: Grid,
-    depth: Float[np.ndarray, "views height width"],
-) -> Int[np.ndarray, "cells views"]:
-    """The id that each view shows at each cell, as in `Surface.shown`. `depth` is that of the first
-    filled cells; inf ignores occlusion."""
-    return _ids_at(cells, ids, cameras.to_image, grid.low_m, grid.cell_m, depth)
+    return Surface(cells, ids_at(cells, near, cameras.to_image, grid.low_m, grid.cell_m, depth))
 
 
 def votes_of(
@@ -284,7 +266,9 @@ def cell_at(eye_m, direction, depth, low_m, cell_m, shape):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _first_hits(ids, eyes_m, rays, low_m, cell_m, filled):
+def first_hits(ids, eyes_m, rays, low_m, cell_m, filled):
+    """Depth in metres of the first filled cell along the ray of each mask pixel, (views, height,
+    width); inf if there is none."""
     depth = np.full(ids.shape, np.inf, np.float32)
     for view, row, column in np.ndindex(ids.shape):
         if ids[view, row, column] <= 0:
@@ -304,7 +288,9 @@ def _first_hits(ids, eyes_m, rays, low_m, cell_m, filled):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
-def _ids_at(cells, ids, to_image, low_m, cell_m, depth):
+def ids_at(cells, ids, to_image, low_m, cell_m, depth):
+    """The id that each view shows at each cell, as in `Surface.shown`. `depth` is that of the first
+    filled cells; inf ignores occlusion."""
     views, height, width = ids.shape
     shown = np.full((len(cells), views), -1, np.int32)
     for i in range(len(cells)):

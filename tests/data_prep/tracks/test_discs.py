@@ -3,7 +3,7 @@
 import numpy as np
 
 from data_prep.tracks.carving import cameras_of
-from data_prep.tracks.singleton_merge import (
+from data_prep.tracks.merging import (
     LARGER,
     LEAST,
     MISFIT,

@@ -7,8 +7,8 @@ import pytest
 from untracked_room import frames, furnished
 
 from data_prep.tracks.carving import BEHIND, CLEAR_M, cameras_of, fill, first_hits, surface, widened
-from data_prep.tracks.cluster_merge import EVERY, hull_coverage
 from data_prep.tracks.clusters import pair_weights
+from data_prep.tracks.merging import EVERY, hull_coverage
 
 
 @pytest.fixture(scope="module")
@@ -80,13 +80,13 @@ def test_filled_cells_hold_the_boxes(scene):
 
 def test_first_hits_and_surface(scene):
     ids, _, cameras, grid = scene
-    depth = first_hits(ids, cameras, grid)
+    depth = first_hits(ids, cameras.eyes_m, cameras.rays, *grid)
     rng = np.random.default_rng(0)
     for view, row, column in rng.permutation(np.argwhere(ids > 0))[:60].tolist():
         first = next(cells_along(cameras, grid, view, row, column, 0.5), (np.inf, ()))[0]
         assert np.isclose(depth[view, row, column], first, rtol=1e-6)  # float32
     assert np.isinf(depth[ids <= 0]).all()
-    cells, shown = surface(ids, cameras, grid, depth)
+    cells, shown = surface(ids, ids, cameras, grid)
     for k in rng.permutation(len(cells))[:60]:
         for view in range(len(ids)):
             u, v, far = seen_at(cameras, view, middle(grid, cells[k]))
