@@ -14,7 +14,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 if TYPE_CHECKING:
     from sceneprior.apps.api import Prior, load
-    from sceneprior.apps.requests import load_request
+    from sceneprior.apps.sample import load_request
     from sceneprior.core.scene import Scene
     from sceneprior.render.scene_files import load_scene, save
     from sceneprior.render.topdown import perspective as picture
@@ -30,7 +30,7 @@ _HOMES = {
     "Prior": "sceneprior.apps.api:Prior",
     "Scene": "sceneprior.core.scene:Scene",
     "load": "sceneprior.apps.api:load",
-    "load_request": "sceneprior.apps.requests:load_request",
+    "load_request": "sceneprior.apps.sample:load_request",
     "load_scene": "sceneprior.render.scene_files:load_scene",
     "picture": "sceneprior.render.topdown:perspective",
     "save": "sceneprior.render.scene_files:save",

@@ -22,7 +22,7 @@ from data_prep.front.recipe import load_recipe
 from sceneprior.apps.cli.commands import app
 from sceneprior.apps.config import load_config
 from sceneprior.apps.experiments.comparison import load_comparison
-from sceneprior.apps.requests import load_request
+from sceneprior.apps.sample import load_request
 from sceneprior.core.scene_json import read_scene
 
 LONGEST_LINE = 110

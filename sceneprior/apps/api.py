@@ -13,8 +13,7 @@ from torch import Tensor
 from sceneprior import __version__
 from sceneprior.apps.config import load_any_run, weights_of, with_latents
 from sceneprior.apps.priors.packed import name_of, version_of
-from sceneprior.apps.requests import request_of
-from sceneprior.apps.sample import sample_rooms
+from sceneprior.apps.sample import request_of, sample_rooms
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene, SceneObject

@@ -1,17 +1,21 @@
-"""Sampling of new rooms from a run of any method."""
+"""New rooms from a run of any method, and requests for them: arguments, JSON, and floors in other
+files."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
+from sceneprior.core.files import read_json
 from sceneprior.core.repeatable import check_seed, single_threaded
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.views import RoomBoxes
 from sceneprior.lifted.config import SAMPLER, TrainedLifted
-from sceneprior.lifted.drawing.scenes import drawn_by_sampler, sample_scenes
-from sceneprior.lifted.requests.request import RoomRequest
+from sceneprior.lifted.drawing.draw import sample_scenes
+from sceneprior.lifted.requests.request import RequestFile, RoomRequest
 from sceneprior.paper.prior import TrainedPrior
-from sceneprior.paper.sampling import decode_latents, draw_latents, scene_names
+from sceneprior.paper.sampling import decode_latents, draw_latents
 from sceneprior.training.method import Trained, TrainedReconstructor
 
 
@@ -44,14 +48,18 @@ def sample_rooms(
             "`sceneprior reconstruct` or `eval-svr`, or a run of another method."
         )
     check_seed(seed)
-    names = scene_names(count, seed)
+    names = [f"seed{seed}_{row:04d}" for row in range(count)]
+    has_sampler = isinstance(trained, TrainedLifted) and trained.sampler is not None
     if completes:
         names = [f"complete_{row:02d}" for row in range(count)]
-        if isinstance(trained, TrainedLifted) and trained.sampler is not None:
-            distribution = SAMPLER
-    own = drawn_by_sampler(trained, distribution) if isinstance(trained, TrainedPrior) else None
-    if own is not None:
-        return sample_scenes(own, names, seed, request, classes, floor_stays=completes)
+        distribution = SAMPLER if has_sampler else distribution
+    if isinstance(trained, TrainedPrior) and (distribution or trained.distribution) == SAMPLER:
+        if not isinstance(trained, TrainedLifted) or not has_sampler:
+            raise InputError(
+                "This run has no sampler, or its stage has not begun; leave out --distribution "
+                f"{SAMPLER}, or train with a section `sampler` (`--config lifted/bedroom.yaml`)."
+            )
+        return sample_scenes(trained, names, seed, request, classes, floor_stays=completes)
     if request is not None or classes is not None:
         others = "these rooms come from latents"
         if not isinstance(trained, TrainedPrior):
@@ -87,3 +95,66 @@ def boxes_to_scenes(rooms: RoomBoxes, label_set_name: str, names: Sequence[str])
         extra = {} if yaw_rad is None else {"yaw_rad": yaw_rad[row, real].tolist()}
         scenes.append(Scene(name, label_set_name, objects, extra=extra))
     return scenes
+
+
+def load_request(path: str | Path) -> dict[str, Any]:
+    """Read a request from JSON, as arguments for `prior.sample(4, **load_request(path))`.
+
+    Raises:
+        InputError: the file is no request.
+    """
+    data = read_json(Path(path))
+    if not isinstance(data, dict):
+        raise InputError(
+            f"{path} is not a request, which docs/requests.md describes: expected a JSON object."
+        )
+    parts = RequestFile.of(str(path), **with_floor_of_file(data)).parts()
+    own = {key: part for key, part in parts.items() if key in data}
+    # A floor's file is only checked here, since options may add openings or a ceiling of their own.
+    return own | ({"floor": data["floor"]} if isinstance(data.get("floor"), str) else {})
+
+
+def request_of(asked: Mapping[str, Any]) -> RoomRequest | None:
+    """The request of these parts, of which None is left out; None if there is no part.
+
+    Raises:
+        InputError: a part is invalid.
+    """
+    asked = with_floor_of_file({key: part for key, part in asked.items() if part is not None})
+    return RoomRequest.of(**asked) if asked else None
+
+
+def with_floor_of_file(asked: dict[str, Any]) -> dict[str, Any]:
+    """Replace a file name given as the floor of a request by the floor in that file. Doors, windows
+    and ceiling are also taken from the file, unless the request has its own.
+
+    Raises:
+        InputError: the file has no floor.
+    """
+    floor = asked.get("floor")
+    named = isinstance(floor, str) and floor.partition(":")[0].endswith((".json", ".npz"))
+    if not named and not isinstance(floor, Path):
+        return asked
+    from sceneprior.interchange.floors import read_floor_file  # imported here: files only
+
+    found = read_floor_file(str(floor))
+    own: dict[str, Any] = {"floor": found.outline_m}
+    if asked.get("openings") is None:
+        own["openings"] = found.openings
+    if asked.get("ceiling_m") is None:
+        own["ceiling_m"] = found.ceiling_m
+    return {**asked, **own}
+
+
+def merged(asked: dict[str, Any], file: dict[str, Any]) -> dict[str, Any]:
+    """Merge the arguments of a request with those of a request's file.
+
+    Raises:
+        InputError: an argument is in both.
+    """
+    own = {key: value for key, value in asked.items() if value is not None}
+    if both := sorted(own.keys() & file.keys()):
+        raise InputError(
+            f"Both the request's file and the options have {', '.join(both)}; leave one out."
+        )
+    return {**file, **own}

@@ -10,7 +10,7 @@ import pytest
 from cli_helpers import one_sentence
 
 import sceneprior
-from sceneprior.apps.requests import load_request, merged
+from sceneprior.apps.sample import load_request, merged
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Opening, Scene, SceneObject
 from sceneprior.lifted.requests.request import RequestFile

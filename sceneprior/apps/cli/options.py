@@ -94,7 +94,7 @@ def request_of(
     asked = {"floor": floor, "openings": openings, "ceiling_m": ceiling, "want": want}
     if request is None and not any(value is not None for value in asked.values()):
         return {}
-    from sceneprior.apps.requests import load_request, merged
+    from sceneprior.apps.sample import load_request, merged
 
     return merged(asked, {} if request is None else load_request(request))
 

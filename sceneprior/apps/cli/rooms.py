@@ -288,8 +288,8 @@ def view(
     import torch
 
     from sceneprior.apps.api import load
-    from sceneprior.apps.requests import with_floor_of_file
     from sceneprior.apps.retrieval.cad_models import open_models
+    from sceneprior.apps.sample import with_floor_of_file
     from sceneprior.apps.viewer.explorer import Explorer, Folder
     from sceneprior.apps.viewer.panel import open_page
     from sceneprior.render.scene_files import load_scene_folder

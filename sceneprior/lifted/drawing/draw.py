@@ -1,26 +1,33 @@
-"""Drawing of rooms: sequential Monte Carlo over partly furnished rooms, repeated until they are
-whole. A plain room has no conditions and one particle."""
+"""Rooms drawn by a sampler, as scenes: sequential Monte Carlo over partly furnished rooms, repeated
+until they are whole. A plain room has no conditions and one particle."""
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from sceneprior.core.classes import label_set, unknown_class
 from sceneprior.core.errors import InputError
+from sceneprior.core.scene import Mesh, Scene, SceneObject, Solid, quarter_turned
+from sceneprior.core.shell import rectangle
+from sceneprior.lifted.config import TrainedLifted
 from sceneprior.lifted.drawing.plans import RoomPlans, check_floor, plan_rooms
 from sceneprior.lifted.drawing.steps import NUMBERS, Particles, Rejections, place_next
-from sceneprior.lifted.prototypes import PosedRooms
+from sceneprior.lifted.lifting import HANGS_M
+from sceneprior.lifted.prototype_decoder import PrototypeDecoder
+from sceneprior.lifted.prototypes import POSES, PosedRooms
 from sceneprior.lifted.requests.floors import RoomShape
-from sceneprior.lifted.requests.relations import furniture_in
+from sceneprior.lifted.requests.relations import RelationChecks, furniture_in
+from sceneprior.lifted.requests.request import RoomRequest
 from sceneprior.lifted.requests.rules import PlacementRules
 from sceneprior.lifted.requests.wishes import Conditions
 from sceneprior.lifted.sampler.contents import END
-from sceneprior.lifted.sampler.frames import FRAME_M, gaps_m
+from sceneprior.lifted.sampler.frames import FRAME_M, gaps_m, side_of
 from sceneprior.lifted.sampler.network import RoomSampler
 
 OPEN_M = 3 * FRAME_M
@@ -53,8 +60,7 @@ PLAIN = Effort(particles=1, attempts=48, attempts_per_plan=16, whole=47, togethe
 REQUESTED = Effort(particles=6, attempts=12, attempts_per_plan=1, whole=4, together=1)
 
 
-@dataclass(frozen=True)
-class SampledRooms:
+class SampledRooms(NamedTuple):
     """Sampled rooms; every part has one entry per room."""
 
     rooms: PosedRooms
@@ -202,3 +208,128 @@ def _in_the_way(rejections: Rejections, missing: Sequence[int], classes: Sequenc
         f"partial rooms each, a {classes[label].replace('_', ' ')} found no place; most places "
         f"lacked {what}. Ask for less, or for a larger floor."
     )
+
+
+def sample_scenes(
+    trained: TrainedLifted,
+    names: Sequence[str],
+    seed: int,
+    request: RoomRequest | None,
+    classes: Sequence[str] | None,
+    floor_stays: bool,
+) -> list[Scene]:
+    """Sample a room with meshes for each name; see `draw_rooms`.
+
+    `extra` of a room lists the rows of the given objects (`given`), the request without them
+    (`request`), and whether each wish holds (`wishes`).
+
+    Args:
+        classes: Classes of the objects to add to the given ones, and no others; instead of wishes.
+            `extra["no_place"]` lists those for which no place was found.
+        floor_stays: Never move the floor; otherwise, a floor without given objects is centred.
+
+    Raises:
+        InputError: the prior does not understand the request, or no room meets it.
+    """
+    sampler, label_names = trained.sampler, label_set(trained.config.label_set)
+    assert sampler is not None, "callers ask trained.sampler first"
+    known = [label_names[row] for row in sampler.drawn_classes]
+    if classes is not None:
+        for label in classes:
+            if label not in known:
+                raise unknown_class(label, known)
+        request = request or RoomRequest()
+        whole = Counter(classes) + Counter(item.label for item in request.objects)
+        want = {label: whole[label] for label in known}
+        request = RoomRequest(**{**request.parts(), "want": want})
+    conditions, told = Conditions(tuple(label_names)), dict[str, Any]()
+    if request is not None:
+        labels, most = trained.config.label_set, sampler.max_objects
+        conditions = request.conditions(known, labels, most, floor_stays)
+        told = {key: part for key, part in request.parts().items() if key != "objects"}
+    drawn = draw_rooms(sampler, conditions, len(names), seed, may_lack=classes is not None)
+    scenes = []
+    for row, name in enumerate(names):
+        extra: dict[str, Any] = {}
+        if classes is not None:
+            extra["no_place"] = sorted(label_names[index] for index in drawn.missing[row])
+        elif told:
+            extra = {"request": told, "wishes": _wishes(sampler, conditions, drawn, row)}
+        if conditions.objects:
+            extra["given"] = list(range(len(conditions.objects)))
+        scenes.append(replace(_scene_of(trained, name, conditions, drawn, row), extra=extra))
+    return scenes
+
+
+def _wishes(
+    sampler: RoomSampler, conditions: Conditions, drawn: SampledRooms, row: int
+) -> list[dict[str, Any]]:
+    """Each wish, and whether it holds in a room."""
+    furniture, wishes = furniture_in(sampler, drawn.rooms, row), conditions.wishes
+    counts = Counter(conditions.classes[index] for index in furniture.object_class)
+    held = [wish.holds(counts[wish.label]) for wish in wishes.counts]
+    if (shape := drawn.shapes[row]) is not None:
+        held += RelationChecks(wishes.relations, shape, conditions.classes).held(furniture)
+    return [
+        {"wish": str(wish), "holds": holds}
+        for wish, holds in zip((*wishes.counts, *wishes.relations), held, strict=True)
+    ]
+
+
+def _scene_of(
+    trained: TrainedLifted, name: str, conditions: Conditions, drawn: SampledRooms, row: int
+) -> Scene:
+    """Convert a sampled room to a scene with meshes; its floor is the room's rectangle, unless the
+    request has another.
+
+    Yaws of objects are those of the fronts of their looks (`find_sides`). Given objects stay as
+    they are; those without a mesh get that of their look.
+    """
+    sampler, shapes, rooms = trained.sampler, trained.prior.shape, drawn.rooms
+    assert isinstance(shapes, PrototypeDecoder), "whose looks the sampler draws"
+    assert sampler is not None and rooms.looks is not None and rooms.rectangle_m is not None
+    fronts = side_of(rooms.looks[row], sampler.fronts)
+    confidence = sampler.front_confidence[rooms.looks[row] // POSES]
+    objects = []
+    for item in rooms.is_object[row].nonzero()[:, 0].tolist():
+        box = rooms.boxes_m[row, item].double().numpy()
+        look, index = int(rooms.looks[row, item]), int(rooms.object_class[row, item])
+        # A given object whose class has no prototype gets no mesh.
+        known = int(sampler.look_class[look]) == index
+        if box[1] - box[4] / 2 < HANGS_M:
+            box[1] = box[4] / 2  # lifted boxes end a little above the floor
+        mesh, solids = _shape_in(shapes, look, box) if known else (None, ())
+        if item < len(conditions.objects):
+            own = conditions.objects[item]
+            objects.append(replace(own, mesh=mesh, solids=solids) if own.mesh is None else own)
+            continue
+        center, size = tuple(box[:3]), tuple(box[3:])
+        # A front at high z, high x, low z or low x is turned by 0, 1, 2 or 3 quarters.
+        turned = quarter_turned(size, int(fronts[item]) + 2)._replace(
+            confidence=float(confidence[item])
+        )
+        objects.append(SceneObject(conditions.classes[index], center, size, mesh, turned, solids))
+    if (shape := drawn.shapes[row]) is None:
+        middle, extents = rooms.rectangle_m[row].double().numpy().reshape(2, 2)
+        floor_m = rectangle(middle - extents / 2, middle + extents / 2).round(3)
+        return Scene(name, trained.config.label_set, tuple(objects), floor_m)
+    return Scene(
+        name, trained.config.label_set, tuple(objects), shape.floor.outline_m,
+        openings=shape.openings, ceiling_m=shape.ceiling_m,
+    )  # fmt: skip
+
+
+def _shape_in(
+    shapes: PrototypeDecoder, look: int, box_m: Float[np.ndarray, "6"]
+) -> tuple[Mesh, tuple[Solid, ...]]:
+    """Mesh and solids of a look in a box. If the box stands on the floor, so does the shape: masks
+    show too little of the lowest parts of some prototypes."""
+    solids = shapes.solids(look, box_m)
+    bottom, top = box_m[1] - box_m[4] / 2, box_m[1] + box_m[4] / 2
+    lowest = min(solid.low_m[1] for solid in solids)
+    if bottom <= 0 < lowest < top / 2:
+        # Parts keep their relative heights, so the empty share of the height is lowest / top.
+        height = top / (1 - lowest / top)
+        box_m = np.array([box_m[0], top - height / 2, box_m[2], box_m[3], height, box_m[5]])
+        solids = shapes.solids(look, box_m)
+    return shapes.mesh(look, box_m), solids
