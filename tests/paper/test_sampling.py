@@ -143,7 +143,7 @@ def test_a_scene_ends_at_the_first_object_whose_completeness_falls(decoded, prio
         np.testing.assert_array_equal(item.center_m, decoded.centers_m[0, source])
         np.testing.assert_array_equal(item.size_m, decoded.sizes_m[0, source])
         np.testing.assert_array_equal(item.mesh.vertices_m, decoded.vertices_m[0, source])
-        np.testing.assert_array_equal(item.mesh.faces, prior.faces)
+        np.testing.assert_array_equal(item.mesh.faces, prior.shape.faces)
 
 
 def test_a_stop_flag_ends_a_scene_after_the_object_that_has_it(decoded, prior):

@@ -131,38 +131,20 @@ CONVENTIONS = ModelConfig.model_fields["completeness_target"].annotation.__args_
 
 
 def test_the_two_conventions_written_out():
-    counts = torch.tensor([1, 3, 5])
-    assert completeness_targets(counts, 5, "first_n").int().tolist() == [
-        [1, 0, 0, 0, 0], [1, 1, 1, 0, 0], [1, 1, 1, 1, 1],
-    ]  # fmt: skip
-    assert completeness_targets(counts, 5, "stop").int().tolist() == [
-        [1, 1, 1, 1, 1], [0, 0, 1, 1, 1], [0, 0, 0, 0, 1],
-    ]  # fmt: skip
-
-
-@pytest.mark.parametrize("convention", CONVENTIONS)
-def test_scores_that_say_what_they_should_keep_the_real_objects(convention):
-    counts = torch.arange(1, 8)
-    logits = completeness_targets(counts, 7, convention).float() * 2 - 1
-    assert torch.equal(kept_objects(logits, convention), torch.arange(7) < counts[:, None])
-
-
-def test_the_first_word_counts():
-    logits = torch.tensor([[2.0, 0.1, -0.1, 5.0], [-1, -2, 3, -1], [-1, -1, -1, -1]])
-    assert kept_objects(logits, "first_n").int().tolist() == [
-        [1, 1, 0, 0],
-        [0, 0, 0, 0],
-        [0, 0, 0, 0],
-    ]
-    # Nobody says stop in the last room: it is as large as rooms can be.
-    assert kept_objects(logits, "stop").int().tolist() == [[1, 0, 0, 0], [1, 1, 1, 0], [1, 1, 1, 1]]
-
-
-def test_only_the_stop_convention_cannot_say_that_a_room_is_empty():
-    none = torch.tensor([0])
-    for convention, kept in (("first_n", 0), ("stop", 1)):
-        logits = completeness_targets(none, 4, convention).float() * 2 - 1
-        assert kept_objects(logits, convention).sum() == kept
+    """Targets keep the real objects; one word of a scene counts. `stop` has no empty rooms."""
+    for convention, targets, kept in (
+        ("first_n", [[0, 0, 0, 0], [1, 0, 0, 0], [1, 1, 1, 0]], [[1, 1, 0, 0], [0, 0, 0, 0]]),
+        ("stop", [[1, 1, 1, 1], [1, 1, 1, 1], [0, 0, 1, 1]], [[1, 0, 0, 0], [1, 1, 1, 0]]),
+    ):
+        counts = torch.tensor([0, 1, 3])
+        found = completeness_targets(counts, 4, convention)
+        assert found.int().tolist() == targets
+        least = counts.clamp(min=int(convention == "stop"))
+        back = kept_objects(found.float() * 2 - 1, convention)
+        assert torch.equal(back, torch.arange(4) < least[:, None])
+        logits = torch.tensor([[2.0, 0.1, -0.1, 5.0], [-1, -2, 3, -1]])
+        assert kept_objects(logits, convention).int().tolist() == kept
+    assert kept_objects(-torch.ones(1, 4), "stop").all()  # nobody says stop
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)

@@ -1,4 +1,4 @@
-"""Hungarian matching against trying every permutation."""
+"""2D boxes of predictions, and Hungarian matching against trying every permutation."""
 
 from dataclasses import replace
 
@@ -8,7 +8,9 @@ from references.losses import best_assignment, pair_cost
 from refusals import refused
 from torch.testing import assert_close
 
-from sceneprior.paper.matching import match_objects, matching_cost
+from sceneprior.core.cameras import boxes_of_points
+from sceneprior.core.proxies import beveled_cube, boxes_of_ellipsoids, place
+from sceneprior.paper.matching import match_objects, matching_cost, seen_boxes
 
 OVERSHOOT = (1.0, 0.3, 0.0)
 
@@ -92,3 +94,31 @@ def test_more_objects_than_slots_says_what_to_set(batch):
     boxes = type(batch.boxes)(batch.boxes.boxes[:, :, :3], batch.boxes.in_frustum[:, :, :3])
     with refused("paper/more objects than predictions", ValueError):
         match_objects(few, boxes, batch.views)
+
+
+@pytest.mark.parametrize(
+    ("proxy", "box_from"), [("ellipsoid", "proxy"), ("beveled_box", "proxy"), ("ellipsoid", "mesh")]
+)
+def test_boxes_are_those_of_mesh_or_proxy_for_the_matched_predictions_alone(
+    batch, torch_rng, proxy, box_from
+):
+    views, placed = batch.views, (batch.scenes.centers_m, batch.scenes.sizes_m)
+    bevels = torch.rand(3, 5, 2, generator=torch_rng, dtype=torch.float64)
+    meshes = torch.rand(3, 5, 9, 3, generator=torch_rng, dtype=torch.float64)
+    scenes = replace(batch.scenes, bevels=bevels, vertices_m=meshes)
+    found = seen_boxes(scenes, views, proxy, box_from)
+    cameras = (views.world_to_camera, views.intrinsics, views.image_size)
+    if box_from == "mesh":
+        wanted = boxes_of_points(meshes, *cameras)
+        without = seen_boxes(replace(scenes, vertices_m=None), views, proxy, box_from)
+        assert torch.equal(without.boxes, seen_boxes(scenes, views, proxy).boxes)
+    elif proxy == "ellipsoid":
+        wanted = boxes_of_ellipsoids(*placed, *cameras)
+    else:
+        wanted = boxes_of_points(place(beveled_cube(bevels), *placed), *cameras)
+    for room, count in enumerate(views.is_object.sum(dim=1).tolist()):
+        for some, every in zip(found, wanted, strict=True):
+            # The same operations on other strides: the last bits may differ.
+            assert_close(some[room, :, :count], every[room, :, :count], rtol=0, atol=1e-12)
+            assert not some[room, :, count:].any()
+    assert found.in_frustum.any()
