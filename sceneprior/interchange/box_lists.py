@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import shapely
 from jaxtyping import Float
 
 from sceneprior.core.boxes import yaw_rotation
@@ -15,15 +14,18 @@ from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json, write_whole
 from sceneprior.core.scene import Mesh, Scene, SceneObject, Turned, bound_m
-from sceneprior.core.scene_json import MOST_OBJECTS, check_box, check_floor
+from sceneprior.core.scene_json import MOST_OBJECTS, check_box
 from sceneprior.core.shell import floor_polygon
+from sceneprior.interchange.floors import FLOOR, floor_outline, floor_plan
 from sceneprior.render.appearance import box_mesh
 
 NEEDED = ("class_labels", "translations", "sizes", "angles")
-FLOOR = ("floor_plan_vertices", "floor_plan_faces", "floor_plan_centroid")
 NOT_FURNITURE = ("start", "empty", "void")
 """Columns of `class_labels` that stand for no object; the column `end` ends the list."""
+ENDS = ("start", "end")
+"""Columns that ATISS appends to the class columns."""
 SIZES = {"half": 2.0, "full": 1.0}
+"""Factors from sizes in a file to full extents."""
 _QUARTER_RAD = 1e-4
 """Tolerance within which an angle counts as a quarter turn; such boxes need no mesh."""
 
@@ -33,8 +35,13 @@ def read_box_lists(
 ) -> list[Scene]:
     """Read the rooms of box lists.
 
+    A file is an `.npz` with one room (arrays over objects) or several (one more leading axis), or a
+    `.json` with one such record, or a list of records. If a file holds several rooms, a number is
+    appended to each room's name.
+
     Args:
-        boxes: A `.npz` or `.json`, or a folder that is searched for them.
+        boxes: A `.npz` or `.json`, or a folder that is searched for them: ATISS stores a folder
+            with a boxes.npz per room.
         classes: Comma-separated names of the columns (or indices) of `class_labels`; None takes
             the label set without void, followed by `start` and `end` if there are two more columns.
         sizes: `half` or `full` extents.
@@ -42,52 +49,29 @@ def read_box_lists(
     if sizes not in SIZES:
         raise InputError(f"No sizes '{sizes}'; expected half (half extents, as in ATISS) or full.")
     columns = None if classes is None else [name.strip() for name in classes.split(",")]
-    return [
-        scene
-        for path, name in _files(Path(boxes))
-        for scene in read_boxes(path, name, label_set_name, columns, SIZES[sizes])
-    ]
-
-
-def _files(boxes: Path) -> list[tuple[Path, str]]:
-    """Box-list files, each with a room name: ATISS stores a folder with a boxes.npz per room."""
-    if boxes.is_file():
-        return [(boxes, boxes.stem)]
-    found = [path for path in sorted(boxes.rglob("*")) if path.suffix in (".npz", ".json")]
-    if not found:
+    boxes = Path(boxes)
+    files = {boxes: boxes.stem}
+    if not boxes.is_file():
+        found = [path for path in sorted(boxes.rglob("*")) if path.suffix in (".npz", ".json")]
+        parts = (path.relative_to(boxes).with_suffix("").parts for path in found)
+        files = {
+            path: "_".join(some).removesuffix("_boxes")
+            for path, some in zip(found, parts, strict=True)
+        }
+    if not files:
         raise InputError(f"{boxes} holds no .npz and no .json; give box lists of ATISS's format.")
-    return [
-        (path, "_".join(path.relative_to(boxes).with_suffix("").parts).removesuffix("_boxes"))
-        for path in found
-    ]
-
-
-def read_boxes(
-    path: Path,
-    name: str,
-    label_set_name: str,
-    columns: Sequence[str] | None = None,
-    size_factor: float = 2.0,
-) -> list[Scene]:
-    """Read the rooms of one file; see `read_box_lists`. If the file holds several rooms, a number
-    is appended to each room's name.
-
-    Args:
-        path: `.npz` with one room (arrays over objects) or several (one more leading axis), or
-            `.json` with one such record, or a list of records.
-        size_factor: Factor from `sizes` to full extents.
-    """
-    rooms = [room for record in _records(path) for room in _one_by_one(path, record)]
     scenes = []
-    for row, room in enumerate(rooms):
-        own = name if len(rooms) == 1 else f"{name}_{row:04d}"
-        objects = tuple(_objects(path, room, label_set_name, columns, size_factor))
-        if len(objects) > MOST_OBJECTS:
-            raise InputError(
-                f"{path}: a room has {len(objects)} objects; expected at most {MOST_OBJECTS}."
-            )
-        come_from = {"converted_from": path.name}
-        scenes.append(Scene(own, label_set_name, objects, floor_outline(path, room), come_from))
+    for path, name in files.items():
+        rooms = [room for record in _records(path) for room in _one_by_one(path, record)]
+        for row, room in enumerate(rooms):
+            objects = tuple(_objects(path, room, label_set_name, columns, SIZES[sizes]))
+            if len(objects) > MOST_OBJECTS:
+                raise InputError(
+                    f"{path}: a room has {len(objects)} objects; expected at most {MOST_OBJECTS}."
+                )
+            own = name if len(rooms) == 1 else f"{name}_{row:04d}"
+            floor_m, extra = floor_outline(path, room), {"converted_from": path.name}
+            scenes.append(Scene(own, label_set_name, objects, floor_m, extra))
     return scenes
 
 
@@ -158,9 +142,10 @@ def _objects(
     size_factor: float,
 ) -> Iterator[SceneObject]:
     known = label_set(label_set_name)
-    labels = _label_names(path, room["class_labels"], known, columns)
-    boxes = (room[key] for key in NEEDED[1:])
-    for label, center, size, angle in zip(labels, *boxes, strict=True):
+    labels = room["class_labels"]
+    if labels.dtype.kind not in "US":
+        labels = _label_names(path, labels, columns or known[1:], columns is None)
+    for label, center, size, angle in zip(labels, *(room[key] for key in NEEDED[1:]), strict=True):
         if label == "end":
             break
         if label in NOT_FURNITURE:
@@ -171,23 +156,21 @@ def _objects(
                 f"{', '.join(known[1:])}, or another --label-set."
             )
         check_box(path, label, center.tolist(), (size_factor * size).tolist())
-        yield turned_box(label, center, size_factor * size, float(angle))
+        yield turned_box(str(label), center, size_factor * size, float(angle))
 
 
 def _label_names(
-    path: Path, labels: np.ndarray, known: Sequence[str], columns: Sequence[str] | None
+    path: Path, labels: np.ndarray, columns: Sequence[str], may_have_ends: bool
 ) -> list[str]:
-    if labels.dtype.kind in "US":
-        return [str(label) for label in labels]
+    """Names of class indices or one-hot rows."""
     if labels.dtype.kind not in "fiub" or labels.shape[1:] == (0,):
         raise InputError(f"{path}: class_labels are neither names, indices nor one-hot rows.")
-    rows = labels.argmax(-1) if labels.ndim == 2 else labels.astype(int)
-    if columns is None:
-        columns = known[1:]
-        if labels.ndim == 2 and labels.shape[1] == len(columns) + 2:
-            columns = [*columns, "start", "end"]
-    wide = labels.shape[1] if labels.ndim == 2 else int(rows.max(initial=-1)) + 1
-    if (labels.ndim == 2 and wide != len(columns)) or wide > len(columns) or (rows < 0).any():
+    one_hot = labels.ndim == 2
+    rows = labels.argmax(-1) if one_hot else labels.astype(int)
+    wide = labels.shape[1] if one_hot else int(rows.max(initial=-1)) + 1
+    if may_have_ends and one_hot and wide == len(columns) + 2:
+        columns = [*columns, *ENDS]
+    if (one_hot and wide != len(columns)) or wide > len(columns) or (rows < 0).any():
         raise InputError(
             f"{path}: class_labels have {wide} columns, but there are {len(columns)} names; give "
             "all names in order with --classes, including start, end and empty."
@@ -219,31 +202,6 @@ def turned_box(
     return replace(item, mesh=Mesh(own.vertices_m @ yaw_rotation(yaw_rad).T + center, own.faces))
 
 
-def floor_outline(path: Path, room: dict[str, Any]) -> np.ndarray | None:
-    """Outline of the floor's triangles relative to its centroid, the origin of ATISS's boxes."""
-    if any(key not in room for key in FLOOR):
-        return None
-    try:
-        vertices, faces, centroid = (np.asarray(room[key]) for key in FLOOR)
-        flat = (vertices.astype(np.float64) - centroid)[:, [0, 2]]
-        check_floor(path, flat)
-        # buffer(0) makes the triangles valid, so that their union is one outline.
-        floor = shapely.union_all([shapely.Polygon(flat[face]).buffer(0) for face in faces])
-        largest = max(shapely.get_parts(floor), key=shapely.area)
-        return np.asarray(largest.exterior.coords)[:-1]
-    except InputError:
-        raise
-    except (ValueError, IndexError, TypeError, OverflowError, shapely.errors.ShapelyError) as error:
-        raise InputError(
-            f"{path}: its floor plan cannot be read ({error}); expected vertices (V, 3), "
-            "triangles (F, 3) and a centroid (3,)."
-        ) from None
-
-
-ENDS = ("start", "end")
-"""Columns that ATISS appends to the class columns."""
-
-
 def write_atiss(scenes: Sequence[Scene], folder: Path) -> None:
     """Write `<room>/boxes.npz` for each room, y up, in metres, with the floor's centre as origin.
 
@@ -268,23 +226,3 @@ def write_atiss(scenes: Sequence[Scene], folder: Path) -> None:
             **floor,
         )
         write_whole(Path(folder) / scene.name / "boxes.npz", buffer.getvalue())
-
-
-def floor_plan(floor: shapely.Geometry) -> dict[str, np.ndarray]:
-    """Convert a floor polygon to ATISS's arrays: triangles at y = 0 that face up, and the origin as
-    centroid.
-
-    >>> floor_plan(shapely.box(-1, -1, 1, 1))["floor_plan_faces"].shape
-    (2, 3)
-    """
-    # A polygon with repeated corners cannot be triangulated.
-    floor = shapely.remove_repeated_points(floor)
-    parts = shapely.get_parts(shapely.constrained_delaunay_triangles(floor))
-    # Counter-clockwise in (x, z) faces down with y up, so the order is reversed.
-    corners = [np.asarray(shapely.orient_polygons(part).exterior.coords)[2::-1] for part in parts]
-    flat = np.concatenate(corners)
-    return {
-        "floor_plan_vertices": np.stack([flat[:, 0], np.zeros(len(flat)), flat[:, 1]], axis=1),
-        "floor_plan_faces": np.arange(len(flat)).reshape(-1, 3),
-        "floor_plan_centroid": np.zeros(3),
-    }

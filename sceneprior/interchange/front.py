@@ -19,7 +19,7 @@ from sceneprior.core.files import json_text, write_json, write_whole
 from sceneprior.core.furniture import MODEL_FILE, category_table, class_of_category
 from sceneprior.core.scene import Scene
 from sceneprior.core.shell import floor_polygon, floor_rectangle
-from sceneprior.interchange.box_lists import floor_plan
+from sceneprior.interchange.floors import floor_plan
 from sceneprior.render.appearance import scene_meshes
 
 ROOM_TYPES = {
@@ -36,60 +36,56 @@ def write_front(scenes: Sequence[Scene], folder: Path) -> None:
     Each object's mesh, or its box, becomes a separate model, with a 3D-FUTURE category that maps to
     the object's class. An unknown floor is written as the rectangle around the furniture.
     """
-    models: list[dict[str, Any]] = []
-    for scene in scenes:
-        house, records = _house(scene, Path(folder) / "3D-FUTURE-model")
-        write_whole(Path(folder) / "3D-FRONT" / f"{scene.name}.json", json_text(house))
-        models += records
-    write_json(Path(folder) / "3D-FUTURE-model" / "model_info.json", models)
-
-
-def _house(scene: Scene, models: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Write the model files of a room; return its house and the records of its models."""
-    furniture: list[dict[str, Any]] = []
-    children: list[dict[str, Any]] = []
+    houses, models = Path(folder) / "3D-FRONT", Path(folder) / "3D-FUTURE-model"
     records: list[dict[str, Any]] = []
-    for index, (item, mesh) in enumerate(zip(scene.objects, scene_meshes(scene), strict=True)):
-        category = category_of_class(item.label, scene.label_set)
-        jid = str(uuid.uuid5(uuid.NAMESPACE_OID, f"{scene.name}/{index}"))
-        # As in 3D-FUTURE, a model's origin is the centre of its lower face.
-        x, y, z = item.center_m
-        origin = np.array([x, y - item.size_m[1] / 2, z])
-        vertices = np.asarray(mesh.vertices_m, dtype=np.float64) - origin
-        lines = [f"v {a:.6f} {b:.6f} {c:.6f}" for a, b, c in vertices.tolist()]
-        lines += [f"f {a} {b} {c}" for a, b, c in (np.asarray(mesh.faces) + 1).tolist()]
-        write_whole(models / jid / MODEL_FILE, "\n".join(lines) + "\n")
-        width, height, depth = item.size_m
-        furniture.append(
-            {
-                "uid": f"{index}/model", "jid": jid, "category": category, "valid": True,
-                "size": [width, depth, height], "bbox": [width, depth, height],
-            }
-        )  # fmt: skip
-        children.append(
-            {"ref": f"{index}/model", "instanceid": f"furniture/{index}", "pos": origin.tolist()}
-            | _POSE
-        )
-        records.append({"model_id": jid, "super-category": "", "category": category})
+    for scene in scenes:
+        furniture, children = [], []
+        for index, (item, mesh) in enumerate(zip(scene.objects, scene_meshes(scene), strict=True)):
+            category = category_of_class(item.label, scene.label_set)
+            jid = str(uuid.uuid5(uuid.NAMESPACE_OID, f"{scene.name}/{index}"))
+            # As in 3D-FUTURE, a model's origin is the centre of its lower face.
+            x, y, z = item.center_m
+            width, height, depth = item.size_m
+            origin = np.array([x, y - height / 2, z])
+            vertices = np.asarray(mesh.vertices_m, dtype=np.float64) - origin
+            lines = [f"v {a:.6f} {b:.6f} {c:.6f}" for a, b, c in vertices.tolist()]
+            lines += [f"f {a} {b} {c}" for a, b, c in (np.asarray(mesh.faces) + 1).tolist()]
+            write_whole(models / jid / MODEL_FILE, "\n".join(lines) + "\n")
+            extent = [width, depth, height]
+            furniture.append(
+                {
+                    "uid": f"{index}/model", "jid": jid, "category": category, "valid": True,
+                    "size": extent, "bbox": extent,
+                }
+            )  # fmt: skip
+            place = {"instanceid": f"furniture/{index}", "pos": origin.tolist()} | _POSE
+            children.append({"ref": f"{index}/model"} | place)
+            records.append({"model_id": jid, "super-category": "", "category": category})
+        house = _house(scene, furniture, children)
+        write_whole(houses / f"{scene.name}.json", json_text(house))
+    write_json(models / "model_info.json", records)
+
+
+def _house(
+    scene: Scene, furniture: list[dict[str, Any]], children: list[dict[str, Any]]
+) -> dict[str, Any]:
     (x0, z0), (x1, z1) = floor_rectangle(scene)
     plan = floor_plan(floor_polygon(scene) or shapely.box(x0, z0, x1, z1))
+    vertices = plan["floor_plan_vertices"]
     floor = {
         "uid": "floor", "type": "Floor", "jid": "", "material": "",
-        "xyz": plan["floor_plan_vertices"].ravel().tolist(),
-        "faces": plan["floor_plan_faces"].ravel().tolist(),
-        "normal": [0.0, 1.0, 0.0] * len(plan["floor_plan_vertices"]),
-        "uv": plan["floor_plan_vertices"][:, [0, 2]].ravel().tolist(),
+        "xyz": vertices.ravel().tolist(), "faces": plan["floor_plan_faces"].ravel().tolist(),
+        "normal": [0.0, 1.0, 0.0] * len(vertices), "uv": vertices[:, [0, 2]].ravel().tolist(),
     }  # fmt: skip
     ground = {"ref": "floor", "instanceid": "mesh/0", "pos": [0, 0, 0]} | _POSE
     kind = ROOM_TYPES.get(scene.label_set, OTHER_ROOM)
     room = {"type": kind, "instanceid": f"{kind}-0", "pos": [0, 0, 0], "empty": 0} | _POSE
-    house = {
+    return {
         "uid": scene.name, "version": "2.0", "design_version": "sceneprior",
         "furniture": furniture, "mesh": [floor],
         "scene": {"ref": "-1", "pos": [0, 0, 0], **_POSE,
                   "room": [room | {"children": [ground, *children]}]},
     }  # fmt: skip
-    return house, records
 
 
 def category_of_class(label: str, label_set_name: str) -> str:

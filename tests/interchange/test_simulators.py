@@ -13,7 +13,6 @@ from rooms_of_solids import solid_box
 from sceneprior.core.colliders import colliders, mass_kg, mesh_of
 from sceneprior.core.scene import Opening, Scene, SceneObject, Solid, Turned, bound_m
 from sceneprior.interchange.export import export_scenes
-from sceneprior.render.scene_files import save
 
 BEDROOM = "front3d_bedroom"
 L = np.array([[-2.5, -2], [2.5, -2], [2.5, 0.5], [0.5, 0.5], [0.5, 2.2], [-2.5, 2.2]])
@@ -81,24 +80,6 @@ def test_mujoco_loads_a_room_with_walls_in_which_nothing_overlaps(scene, tmp_pat
         eye, north = np.array([x, 1.0, 1.0]), np.array([0.0, 1.0, 0.0])
         hit = mujoco.mj_ray(model, state, eye, north, None, 1, -1, np.zeros(1, np.int32))
         assert hit == pytest.approx(expected)
-
-
-def test_usd_holds_meshes_in_metres_with_y_up(scene, tmp_path):
-    geometry = pytest.importorskip("pxr.UsdGeom")
-    save(scene, tmp_path / "room.usda", shell="floor")
-    stage = pytest.importorskip("pxr.Usd").Stage.Open(str(tmp_path / "room.usda"))
-    assert geometry.GetStageUpAxis(stage) == "Y" and geometry.GetStageMetersPerUnit(stage) == 1.0
-    *objects, floor = stage.GetDefaultPrim().GetChildren()
-    assert floor.GetName() == "floor"
-    for prim, item in zip(objects, scene.objects, strict=True):
-        assert prim.GetAttribute("userProperties:class").Get() == item.label
-        (shape,) = prim.GetChildren()
-        points = np.array(geometry.Mesh(shape).GetPointsAttr().Get())
-        placed = points + geometry.Xformable(prim).GetLocalTransformation().ExtractTranslation()
-        low, high = placed.min(axis=0), placed.max(axis=0)
-        np.testing.assert_allclose((low + high) / 2, item.center_m, atol=1e-6)
-        np.testing.assert_allclose(high - low, item.size_m, atol=1e-6)
-        assert not prim.GetAppliedSchemas()
 
 
 def test_usd_of_simulators_has_bodies_and_passes_every_check(scene, tmp_path):
