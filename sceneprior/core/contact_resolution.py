@@ -231,40 +231,30 @@ def is_stable(item: SceneObject) -> bool:
 
 
 def _feet(bodies: tuple[Solid | Mesh, ...]) -> tuple[Solid, ...]:
+    """Boxes near the corners of an object. Each supports the body with the lowest cost, which
+    favours low bodies near the corner."""
     clouds = [points_of(body) for body in bodies]
     floor_m = min(float(points[:, 1].min()) for points in clouds)
     every = np.concatenate(clouds)
     low, high = every[:, ::2].min(axis=0), every[:, ::2].max(axis=0)
     half = np.minimum(WIDE_M, (high - low) / 4) / 2
+    # Only the lower parts, because the rim of a round body may be as high as the object.
+    lower = [
+        points[points[:, 1] <= points[:, 1].min() + LOWER * np.ptp(points[:, 1])]
+        for points in clouds
+    ]
+    plans = [shapely.convex_hull(shapely.MultiPoint(points[:, ::2])) for points in lower]
     feet = []
     for corner in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        at = np.where(corner, high - half, low + half)
-        place, top_m = _under(clouds, at, floor_m)
-        if top_m - floor_m <= CONTACT_M:
-            continue  # a body stands on the floor there
-        feet.append(
-            Solid(
-                "box",
-                (float(place[0] - half[0]), floor_m, float(place[1] - half[1])),
-                (float(place[0] + half[0]), top_m + INTO_M, float(place[1] + half[1])),
-            )
-        )
+        at = shapely.Point(np.where(corner, high - half, low + half))
+        found = []
+        for points, plan in zip(lower, plans, strict=True):
+            place = shapely.get_coordinates(shapely.shortest_line(at, plan))[-1]
+            away = np.abs(place - [at.x, at.y]).sum()
+            cost = float(away + HIGH * (points[:, 1].min() - floor_m))
+            found.append((cost, place, float(points[:, 1].max())))
+        _, place, top_m = min(found, key=lambda one: one[0])
+        if top_m - floor_m > CONTACT_M:  # or else a body stands on the floor there
+            (x0, z0), (x1, z1) = (place - half).tolist(), (place + half).tolist()
+            feet.append(Solid("box", (x0, floor_m, z0), (x1, top_m + INTO_M, z1)))
     return tuple(feet)
-
-
-def _under(
-    clouds: list[Float[np.ndarray, "_ 3"]], at: Float[np.ndarray, "2"], floor_m: float
-) -> tuple[Float[np.ndarray, "2"], float]:
-    """Position (x, z) and top of the foot at a corner, `at`. The foot supports the body with the
-    lowest cost, which favours low bodies near the corner."""
-    found = []
-    for points in clouds:
-        # Only the lower part, because the rim of a round body may be as high as the object.
-        heights = points[:, 1]
-        lower = points[heights <= heights.min() + LOWER * np.ptp(heights)]
-        plan = shapely.convex_hull(shapely.MultiPoint(lower[:, ::2]))
-        nearest = shapely.get_coordinates(shapely.shortest_line(shapely.Point(at), plan))[-1]
-        cost = np.abs(nearest - at).sum() + HIGH * (heights.min() - floor_m)
-        found.append((float(cost), nearest, float(lower[:, 1].max())))
-    _, place, top_m = min(found, key=lambda one: one[0])
-    return place, top_m

@@ -158,43 +158,6 @@ class FlatViews(Batch):
             sides_clear=joined("sides_clear", 4),
         )
 
-    def gather(
-        self,
-        room: Int[Tensor, " batch"],
-        view: Int[Tensor, "batch views"],
-        quarter: Int[Tensor, " batch"],
-        objects: int,
-        blank: Bool[Tensor, " batch"] | None = None,
-    ) -> dict[str, Any]:
-        """Gather views of rooms as fields of `SceneViews`.
-
-        `view` holds indices within the room. Each room is rotated by `quarter` quarter turns about
-        +y, and padded to `objects` objects. A room marked in `blank` is returned without objects.
-        """
-        slot = torch.arange(objects, device=self.boxes.device)
-        count = self.object_count[room][:, None]
-        is_object = slot < count
-        if blank is not None:
-            is_object = is_object & ~blank[:, None]
-        at_object = self.first_object[room][:, None] + slot
-        at_object = at_object.where(is_object, len(self.object_class) - 1)
-        at_sighting = (self.first_sighting[room][:, None] + view * count)[:, :, None] + slot
-        at_sighting = at_sighting.where(is_object[:, None], len(self.visible) - 1)
-        at_view = self.first_view[room][:, None] + view
-        poses = self.world_to_camera[at_view]
-        return {
-            "object_class": self.object_class[at_object].long(),
-            "is_object": is_object,
-            # The cameras are rotated with the room, so the images stay the same.
-            "world_to_camera": torch.cat(
-                [turn_vectors(poses[..., :3], quarter), poses[..., 3:]], dim=-1
-            ),
-            "intrinsics": self.intrinsics[at_view],
-            "boxes": self.boxes[at_sighting],
-            "visible": self.visible[at_sighting],
-            "sides_clear": self.sides_clear[at_sighting],
-        }
-
 
 def allowed_views(
     seed: int, room: int, count: int, fraction: float, held_out: bool = False
@@ -275,15 +238,28 @@ class ViewDataset(RoomDataset):
             if stacked.dtype == np.uint16:  # torch cannot compare uint16
                 stacked = stacked.astype(np.int32)
             ids = torch.from_numpy(stacked).to(device)
+        flat, room, view = self.flat, *(torch.from_numpy(x).to(device) for x in (rooms, views))
+        slot = torch.arange(int(self._object_counts[rooms].max()), device=device)
+        count = flat.object_count[room][:, None]
+        blank = torch.tensor([epoch == BLANK for _, epoch in draws], device=device)
+        is_object = (slot < count) & ~blank[:, None]
+        at_object = flat.first_object[room][:, None] + slot
+        at_object = at_object.where(is_object, len(flat.object_class) - 1)
+        at_sighting = (flat.first_sighting[room][:, None] + view * count)[:, :, None] + slot
+        at_sighting = at_sighting.where(is_object[:, None], len(flat.visible) - 1)
+        at_view = flat.first_view[room][:, None] + view
+        # The cameras are rotated with the room, so the images stay the same.
+        turn, shift = flat.world_to_camera[at_view].split([3, 1], dim=-1)
+        turn = turn_vectors(turn, torch.from_numpy(quarters).to(device))
         return SceneViews(
             room_index=torch.from_numpy(rows).to(device),
-            **self.flat.gather(
-                torch.from_numpy(rooms).to(device),
-                torch.from_numpy(views).to(device),
-                torch.from_numpy(quarters).to(device),
-                int(self._object_counts[rooms].max()),
-                torch.tensor([epoch == BLANK for _, epoch in draws], device=device),
-            ),
+            object_class=flat.object_class[at_object].long(),
+            is_object=is_object,
+            world_to_camera=torch.cat([turn, shift], dim=-1),
+            intrinsics=flat.intrinsics[at_view],
+            boxes=flat.boxes[at_sighting],
+            visible=flat.visible[at_sighting],
+            sides_clear=flat.sides_clear[at_sighting],
             image_size=self._image_sizes[rooms[0]],
             instance_ids=ids,
             room_ids=tuple(self.plain_ids[room] for room in rooms),

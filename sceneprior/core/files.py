@@ -87,7 +87,7 @@ def check_writable(path: Path) -> None:
     """
     path = Path(path)
     folder = path if path.is_dir() else path.parent
-    made = _missing_folders(folder)
+    made = [path for path in (folder, *folder.parents) if not path.exists()]
     trial = folder / f"{path.name}.{secrets.token_hex(4)}{PART}"
     try:
         write_whole(trial, bytes(_TRIAL_BYTES))
@@ -99,7 +99,7 @@ def check_writable(path: Path) -> None:
         _remove_empty(made)
 
 
-def check_free(folder: Path, overwrite: bool = False) -> None:
+def check_free(folder: Path, overwrite: bool) -> None:
     """Check that a folder can be written, and is empty unless `overwrite` is true."""
     folder = Path(folder)
     if folder.is_file():
@@ -116,7 +116,7 @@ def only_writer(folder: Path) -> Iterator[None]:
     Folders created here are removed again if they stay empty.
     """
     folder = Path(folder)
-    made = _missing_folders(folder)
+    made = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     # Locking the folder itself leaves no lock file, and the kernel unlocks it after a kill.
     descriptor = os.open(folder, os.O_RDONLY)
@@ -125,11 +125,8 @@ def only_writer(folder: Path) -> Iterator[None]:
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                holder = _lock_holder(descriptor)
-                who = "" if holder is None else f" (process {holder})"
                 raise InputError(
-                    f"Another run is writing to {folder}; wait for it{who}, or choose another "
-                    "folder."
+                    f"Another run is writing to {folder}; wait for it, or choose another folder."
                 ) from None
         yield
     finally:
@@ -140,23 +137,6 @@ def only_writer(folder: Path) -> Iterator[None]:
             with contextlib.suppress(OSError):
                 fcntl.flock(descriptor, fcntl.LOCK_UN)
             os.close(descriptor)
-
-
-def _lock_holder(descriptor: int) -> str | None:
-    """Id of the process that has locked a folder, if the kernel reveals it."""
-    status = os.fstat(descriptor)
-    device, inode = status.st_dev, status.st_ino
-    place = f"{os.major(device):02x}:{os.minor(device):02x}:{inode}"
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/locks").read_text().splitlines():
-            words = line.split()
-            if "FLOCK" in words and place in words:
-                return words[words.index(place) - 1]
-    return None
-
-
-def _missing_folders(folder: Path) -> list[Path]:
-    return [path for path in (folder, *folder.parents) if not path.exists()]
 
 
 def _remove_empty(folders: list[Path]) -> None:

@@ -40,7 +40,16 @@ def read_class_table(path: Path) -> dict[int, str]:
     """
     try:
         content = path.read_text(encoding="utf-8-sig")
-        pairs = _json_rows(path, content) if path.suffix.lower() == ".json" else _csv_rows(content)
+        if path.suffix.lower() == ".json":
+            pairs = _json_rows(path, content)
+        else:
+            lines = csv.reader(io.StringIO(content))
+            rows = [row for row in lines if any(cell.strip() for cell in row)]
+            if rows and not rows[0][0].strip().isdigit():
+                rows = rows[1:]
+            if short := [row for row in rows if len(row) < 2]:
+                raise ValueError(f"a row '{plain(short[0][0])}' has no class")
+            pairs = [(row[0].strip(), row[1]) for row in rows]
     except (OSError, ValueError, RecursionError, csv.Error) as error:
         if isinstance(error, InputError):
             raise
@@ -71,7 +80,12 @@ def _json_rows(path: Path, content: str) -> Iterable[tuple[str, str]]:
     if isinstance(data, _Pairs) and (listed := [rows for key, rows in data if key in _ROWS]):
         data = listed[0]
     if isinstance(data, list) and not isinstance(data, _Pairs):
-        rows = [_listed_row(row) for row in data]
+        rows = []
+        for row in data:
+            values = dict(row) if isinstance(row, _Pairs) else {}
+            ids = [values[key] for key in _IDS if key in values]
+            labels = [values[key] for key in _NAMES if key in values]
+            rows.append((str(ids[0]), labels[0]) if ids and labels else ("", None))
     elif isinstance(data, _Pairs):
         rows = [(key.strip(), name) for key, name in data]
     else:
@@ -86,23 +100,6 @@ def _json_rows(path: Path, content: str) -> Iterable[tuple[str, str]]:
 
 class _Pairs(list[tuple[str, Any]]):
     """A JSON object as (key, value) pairs; a separate type, to distinguish it from a JSON list."""
-
-
-def _listed_row(row: Any) -> tuple[str, Any]:
-    """Id and class of a segmenter's row; the class is None if either is missing."""
-    values = dict(row) if isinstance(row, _Pairs) else {}
-    ids = [values[key] for key in _IDS if key in values]
-    names = [values[key] for key in _NAMES if key in values]
-    return (str(ids[0]), names[0]) if ids and names else ("", None)
-
-
-def _csv_rows(content: str) -> Iterable[tuple[str, str]]:
-    rows = [row for row in csv.reader(io.StringIO(content)) if any(cell.strip() for cell in row)]
-    if rows and not rows[0][0].strip().isdigit():
-        rows = rows[1:]
-    if short := [row for row in rows if len(row) < 2]:
-        raise ValueError(f"a row '{plain(short[0][0])}' has no class")
-    return [(row[0].strip(), row[1]) for row in rows]
 
 
 def tidy(name: str) -> str:
@@ -180,9 +177,9 @@ def png_kind(data: bytes) -> tuple[int, str] | None:
     return data[24], _COLORS.get(data[25], "unknown colours")
 
 
-def mask_size(path: Path, rgb: bool = False) -> tuple[int, int]:
+def mask_size(path: Path) -> tuple[int, int]:
     """Read the size of a mask, (height, width), without its pixels."""
-    with _open(path, rgb) as picture:
+    with _open(path, rgb=False) as picture:
         return picture.height, picture.width
 
 

@@ -150,19 +150,11 @@ def _sizes(name: str, rng: np.random.Generator) -> list[Vector]:
     deep = deep_with * wide + np.sqrt(1 - deep_with**2) * rng.normal(size=VARIANTS)
     sides = []
     for (p10, p50, p90), scores in zip(real_sizes()[name], (wide, high, deep), strict=True):
-        ranks = np.argsort(np.argsort(scores))
-        sides.append([round(at_score(p10, p50, p90, even[rank]), 4) for rank in ranks])
+        ranked = [even[rank] for rank in np.argsort(np.argsort(scores))]
+        # Two half log-normals, joined at the median; no size is far beyond the percentiles.
+        growth = [((p10 if score < 0 else p90) / p50, min(abs(score), 1.7)) for score in ranked]
+        sides.append([round(p50 * ratio ** (score / 1.2816), 4) for ratio, score in growth])
     return list(zip(*sides, strict=True))
-
-
-def at_score(low: float, middle: float, high: float, score: float) -> float:
-    """Map a standard normal score to a size: two half log-normals joined at the median.
-
-    Scores are clipped to +-1.7; -1.2816, 0 and 1.2816 give `low`, `middle` and `high`.
-    """
-    score = float(np.clip(score, -1.7, 1.7))
-    end = low if score < 0 else high
-    return middle * (end / middle) ** (abs(score) / 1.2816)
 
 
 @lru_cache(maxsize=1)

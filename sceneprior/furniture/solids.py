@@ -68,18 +68,15 @@ def beveled_box(
         inset = bevel * (1 - np.cos(angle))
         rise = np.sign(angle) * bevel * np.sin(abs(angle)) / np.sin(1.2)
         level = h / 2 + (h / 2 - bevel) * (1 if len(rings) >= steps else -1) + rise
-        outline = _rounded_rectangle(w / 2 - inset, d / 2 - inset, max(bevel - inset, 1e-3), steps)
+        half_x, half_z, radius = w / 2 - inset, d / 2 - inset, max(bevel - inset, 1e-3)
+        corners = []
+        for quarter, (sx, sz) in enumerate([(1, 1), (-1, 1), (-1, -1), (1, -1)]):
+            turn = np.linspace(0, np.pi / 2, steps) + quarter * np.pi / 2
+            around = sx * (half_x - radius) + radius * np.cos(turn)
+            corners.append(curve(around, sz * (half_z - radius) + radius * np.sin(turn)))
+        outline = np.concatenate(corners)
         rings.append(np.insert(outline, 1, level, axis=1))
     return shifted(loft(rings), x, y, z)
-
-
-def _rounded_rectangle(half_x: Number, half_z: Number, radius: Number, steps: int) -> np.ndarray:
-    corners = []
-    for quarter, (sx, sz) in enumerate([(1, 1), (-1, 1), (-1, -1), (1, -1)]):
-        turn = np.linspace(0, np.pi / 2, steps) + quarter * np.pi / 2
-        x = sx * (half_x - radius) + radius * np.cos(turn)
-        corners.append(curve(x, sz * (half_z - radius) + radius * np.sin(turn)))
-    return np.concatenate(corners)
 
 
 def lathe(

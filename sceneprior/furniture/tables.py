@@ -42,11 +42,6 @@ DINING_WIDTH_M = 1.0
 """Minimum width of a dining table; narrower tables are side tables."""
 
 
-def _around(count: int, x: Number, z: Number) -> list[tuple[Number, Number]]:
-    turns = np.arange(count) * 2 * np.pi / count
-    return [(x * np.sin(turn), z * np.cos(turn)) for turn in turns]
-
-
 VOCABULARY: dict[str, Any] = {
     **PARTS,
     **{each: getattr(np, each) for each in ("arange", "array", "clip", "cos", "linspace", "sin")},
@@ -55,7 +50,9 @@ VOCABULARY: dict[str, Any] = {
     # Positions of parts on both sides, in the four corners, or in a ring.
     "both": lambda x: (-x, x),
     "corners": lambda x, z: ((-x, -z), (-x, z), (x, -z), (x, z)),
-    "around": _around,
+    "around": lambda count, x, z: [
+        (x * np.sin(turn), z * np.cos(turn)) for turn in np.arange(count) * 2 * np.pi / count
+    ],
     "DEEP_SOFA_M": DEEP_SOFA_M,
     "DINING_WIDTH_M": DINING_WIDTH_M,
 }

@@ -7,7 +7,7 @@ import pytest
 
 from sceneprior.core.classes import LABEL_SETS
 from sceneprior.furniture import solids
-from sceneprior.furniture.catalog import at_score, make_catalog, real_sizes
+from sceneprior.furniture.catalog import make_catalog, real_sizes
 from sceneprior.furniture.tables import Table, build, furniture_tables
 
 
@@ -118,5 +118,3 @@ def test_sizes_keep_to_the_real_percentiles():
             assert median(sizes) == pytest.approx(middle, rel=0.15), (name, axis)
             assert low < median(sizes) < high
             assert sum(low <= size <= high for size in sizes) >= 10
-    at_ends = [at_score(1.0, 2.0, 6.0, score) for score in (-1.2816, 0.0, 1.2816)]
-    assert at_ends == pytest.approx([1, 2, 6])

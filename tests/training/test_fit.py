@@ -1,7 +1,6 @@
 """Training on toy rooms: what a run leaves behind, how it stops and goes on, what it may read."""
 
 import csv
-import os
 import shutil
 import signal
 import subprocess
@@ -250,7 +249,7 @@ def test_a_second_training_of_the_same_run_is_refused(toy_shards, tmp_path, monk
     config, run = tiny_config(toy_shards, layout__epochs=1, shape__epochs=1), tmp_path / "run"
     with only_writer(run):
         for resume in (False, True):
-            with refused("training/another run writes", tmp=tmp_path, pid=os.getpid()):
+            with refused("training/another run writes", tmp=tmp_path):
                 fit(config, run, resume=resume, trainer_options=CPU)
         # The other processes of the training that holds the folder do not ask for it.
         with monkeypatch.context() as patch:

@@ -1,8 +1,7 @@
-"""Off-screen instance ids with pyrender, on EGL or OSMesa."""
+"""Off-screen instance ids with pyrender, on EGL."""
 
 import contextlib
 import ctypes
-import ctypes.util
 import functools
 import importlib.util
 import os
@@ -43,10 +42,6 @@ def id_renderer_class() -> type:
         _main_fb_dims: tuple[Any, Any]
         _ids: Any = None
 
-        def _sorted_mesh_nodes(self, scene: Any) -> list[Any]:
-            # pyrender iterates over a set, whose order would decide between equally near faces.
-            return sorted(scene.mesh_nodes, key=lambda node: node.mesh.name)
-
         def _forward_pass(
             self, scene: Any, flags: int, seg_node_map: Any = None
         ) -> tuple[np.ndarray, None] | None:
@@ -65,7 +60,8 @@ def id_renderer_class() -> type:
                 gl.glGetUniformLocation(program, "world_to_clip"), 1, gl.GL_TRUE, world_to_clip
             )
             color_place = gl.glGetUniformLocation(program, "color")
-            for node in self._sorted_mesh_nodes(scene):
+            # A set's order would decide between equally near faces.
+            for node in sorted(scene.mesh_nodes, key=lambda node: node.mesh.name):
                 red, green, blue = seg_node_map[node]
                 gl.glUniform3f(color_place, red / 255, green / 255, blue / 255)
                 for primitive in node.mesh.primitives:
@@ -121,18 +117,8 @@ def id_renderer_class() -> type:
             self._main_fb_dims = (None, None)
 
         def _read_main_framebuffer(self, scene: Any, flags: int) -> tuple[np.ndarray, None]:
-            gl.glBindFramebuffer(gl.GL_READ_FRAMEBUFFER, self._main_fb)
-            return self._read_ids(), None
-
-        # OSMesa draws into the window's buffer, which pyrender reads by these two methods.
-        def read_color_buf(self) -> np.ndarray:
-            return self._read_ids()
-
-        def read_depth_buf(self) -> None:
-            return None
-
-        def _read_ids(self) -> np.ndarray:
             """(height, width) uint16: the red and the green byte of each pixel."""
+            gl.glBindFramebuffer(gl.GL_READ_FRAMEBUFFER, self._main_fb)
             ids = np.empty((self.viewport_height, self.viewport_width), dtype="<u2")
             gl.glPixelStorei(gl.GL_PACK_ALIGNMENT, 1)
             # The raw call, since PyOpenGL's wrapper does not support this format.
@@ -140,7 +126,7 @@ def id_renderer_class() -> type:
                 0, 0, self.viewport_width, self.viewport_height, gl.GL_RG, gl.GL_UNSIGNED_BYTE,
                 ctypes.c_void_p(ids.ctypes.data),
             )  # fmt: skip
-            return ids[::-1]  # GL's first row is the lowest
+            return ids[::-1], None  # GL's first row is the lowest
 
     return IdRenderer
 
@@ -152,8 +138,8 @@ class NoGLError(Exception):
     """GL does not work on this machine; the message completes "because ..."."""
 
 
-def _probe_gl() -> str:
-    """Find the GL platform with ctypes alone: "egl" or "osmesa".
+def _probe_gl() -> None:
+    """Find with ctypes alone whether EGL has a device; raise a `NoGLError` if not.
 
     PyOpenGL is not imported for this: its errors without GL are unhelpful, and it chooses its
     platform once per process.
@@ -170,14 +156,10 @@ def _probe_gl() -> str:
                 ctypes.c_uint, ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(ctypes.c_int)
             )(address)
             query(0, None, ctypes.byref(count))
-        if count.value > 0:
-            return "egl"
-        reason = "EGL has no device (no driver is installed)"
     except (OSError, AttributeError):
-        reason = "libEGL or libGL is not installed"
-    if ctypes.util.find_library("OSMesa"):
-        return "osmesa"
-    raise NoGLError(reason)
+        raise NoGLError("libEGL or libGL is not installed") from None
+    if count.value == 0:
+        raise NoGLError("EGL has no device (no driver is installed)")
 
 
 _pyrender: "_PyrenderRenderer | None" = None  # one per process: deleting one breaks the others
@@ -188,10 +170,14 @@ def open_pyrender() -> "_PyrenderRenderer":
     global _pyrender, _failure
     if _pyrender is None and _failure is None:
         try:
-            _load_triton_before_mesa()
-            platform = _probe_gl()
+            # Mesa's software GL and Triton each load an LLVM. A process that loads Triton second,
+            # as Lightning does if Triton is installed, crashes with a segmentation fault.
+            if importlib.util.find_spec("triton") is not None:
+                with contextlib.suppress(Exception):  # a broken Triton should fail where it is used
+                    importlib.import_module("triton")
+            _probe_gl()
             if "OpenGL" not in sys.modules:  # PyOpenGL chooses at its first import
-                os.environ.setdefault("PYOPENGL_PLATFORM", platform)
+                os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
             _pyrender = _PyrenderRenderer()
         except NoGLError as error:
             _failure = str(error)
@@ -203,16 +189,8 @@ def open_pyrender() -> "_PyrenderRenderer":
     return _pyrender
 
 
-def _load_triton_before_mesa() -> None:
-    # Mesa's software GL and Triton each load an LLVM. A process that loads Triton second, as
-    # Lightning does if Triton is installed, crashes with a segmentation fault.
-    if importlib.util.find_spec("triton") is not None:
-        with contextlib.suppress(Exception):  # a broken Triton should fail where it is used
-            importlib.import_module("triton")
-
-
 class _PyrenderRenderer(Renderer):
-    """pyrender's SEG pass on EGL or OSMesa."""
+    """pyrender's SEG pass on EGL."""
 
     kind = "pyrender"
 
@@ -226,7 +204,7 @@ class _PyrenderRenderer(Renderer):
 
         self._pyrender = pyrender
         self._process = os.getpid()
-        # OffscreenRenderer creates its renderer by this name, again at each size under OSMesa.
+        # OffscreenRenderer creates its renderer by this name.
         pyrender.offscreen.Renderer = id_renderer_class()
         self._offscreen = _open_context(pyrender)
         self._offscreen._platform.make_current()
