@@ -24,11 +24,10 @@ def refuse(number: int):
     return refused
 
 
-@pytest.mark.parametrize("kept", [0, 3000])
-def test_damaged_shards_are_a_sentence_and_leave_no_run(command, toy_shards, tmp_path, kept):
+def test_damaged_shards_are_a_sentence_and_leave_no_run(command, toy_shards, tmp_path):
     corrupt = shutil.copytree(toy_shards, tmp_path / "corrupt")
     victim = list_shards(corrupt, "train")[1]
-    victim.write_bytes(victim.read_bytes()[:kept])
+    victim.write_bytes(victim.read_bytes()[:3000])
     config = write_tiny_config(tmp_path / "tiny.yaml", corrupt)
     said = one_sentence(command("fit", "--config", config, "--run", "run", "--accelerator", "cpu"))
     assert str(victim) in said and "the file is damaged. Delete it and run the same" in said
@@ -36,9 +35,8 @@ def test_damaged_shards_are_a_sentence_and_leave_no_run(command, toy_shards, tmp
 
 
 def test_options_that_lightning_refuses_are_a_sentence(command, toy_shards, tmp_path):
-    config = "paper/bedroom_small.yaml"  # opens its data silently
-    call = ["fit", "--config", config, "--run", "new", "--set", f"data.shards={toy_shards}"]
-    said = one_sentence(command(*call, "--accelerator", "quantum"))
+    call = ["fit", "--config", "paper/bedroom_small.yaml", "--run", "new", "--set"]
+    said = one_sentence(command(*call, f"data.shards={toy_shards}", "--accelerator", "quantum"))
     assert "Lightning cannot train with --devices auto, --accelerator quantum" in said
     assert not (tmp_path / "new").exists()
 
@@ -86,39 +84,6 @@ def test_a_folder_that_is_not_empty_is_noticed_before_torch_is_imported(tmp_path
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout == "False\n" and "is not empty; add --overwrite" in done.stderr
-
-
-@pytest.mark.slow
-def test_commands_on_a_disk_that_is_full(command, toy_run, toy_shards, tmp_path):
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=100k", "tmpfs", str(disk)], capture_output=True
-    )
-    if mounted.returncode:
-        pytest.skip("only root mounts a small disk")
-
-    def on_full(*words) -> str:
-        status, _, errors = command(*words)
-        last = errors.strip().splitlines()[-1]  # progress bars may stand before it
-        assert status == 2 and "Traceback" not in errors, errors
-        assert last.endswith(
-            "(No space left on device); free space on its disk, or name another folder."
-        )
-        return last
-
-    try:
-        config = write_tiny_config(tmp_path / "tiny.yaml", toy_shards)
-        fit = ["fit", "--accelerator", "cpu", "--config", config, "--run"]
-        assert "homes cannot be" in on_full("make-homes", disk / "homes", "--rooms", 2)
-        assert f"{disk / 'run'}" in on_full(*fit, disk / "run")
-        shutil.rmtree(disk / "run")
-        (disk / "fill").write_bytes(bytes(96_000))
-        said = on_full("synthesize", "--run", toy_run, "--out", disk / "rooms")
-        assert f"{disk / 'rooms'} cannot be" in said
-        assert f"{disk / 'full'}" in on_full(*fit, disk / "full")
-    finally:
-        subprocess.run(["umount", str(disk)], check=True)
 
 
 def test_a_page_needs_its_extra_and_a_host(command, monkeypatch):

@@ -37,10 +37,8 @@ BODIES = {
     "plain": "press()",
     "weak reference": "weakref.finalize; x = type('X', (), {})(); "
     "r = weakref.ref(x, lambda _: press()); del x",
-    "deletion": "x = type('X', (), {'__del__': lambda _: press()})(); del x",
     "bare except": "exec('try:\\n    press()\\nexcept:\\n    pass')",
     "another error": "exec('try:\\n    press()\\nexcept BaseException:\\n    raise ValueError')",
-    "a module": "exec('press()')",
     "long clean-up": "exec('try:\\n    press()\\nfinally:\\n    time.sleep(1.5)\\n    print(1)')",
 }
 

@@ -1,10 +1,7 @@
 """Commands that make rooms, and share them: the files that they write, and their notes."""
 
-import base64
-import io
 import json
 import os
-import re
 import shutil
 from pathlib import Path
 
@@ -13,7 +10,6 @@ import torch
 import trimesh
 from cli_helpers import everything_in, one_sentence
 from model_folder import corner_sofa, write_models
-from toy_metrics import without_classifiers
 
 from sceneprior.apps.config import load_run
 from sceneprior.apps.priors.packed import shipped_priors
@@ -53,16 +49,11 @@ def test_synthesize_writes_rooms_and_the_same_again(command, toy_run, tmp_path):
 
 
 def test_synthesize_writes_walls_if_asked(command, toy_run, tmp_path):
-    call = ["synthesize", "--run", toy_run, "-n", 1, "--html", "--out"]
+    call = ["synthesize", "--run", toy_run, "-n", 1, "--out"]
     for shell, nodes in (("walls", {"floor", "wall_0", "ceiling"}), ("none", set())):
         assert command(*call, shell, "--shell", shell)[0] == 0
         found = set(trimesh.load_scene(tmp_path / shell / "seed0_0000.glb").graph.nodes_geometry)
         assert found & {"floor", "wall_0", "ceiling"} == nodes
-        page = (tmp_path / shell / "rooms.html").read_text()
-        (model,) = re.findall('src="data:model/gltf-binary;base64,([^"]+)"', page)
-        model = trimesh.load_scene(io.BytesIO(base64.b64decode(model)), file_type="glb")
-        shown = set(model.graph.nodes_geometry) & {"floor", "wall_0", "ceiling"}
-        assert shown == {"floor"} | nodes  # a page shows the floor in any case
     pictures = [(tmp_path / shell / "overview.png").read_bytes() for shell in ("walls", "none")]
     assert pictures[0] != pictures[1]
 
@@ -84,15 +75,6 @@ def test_empty_rooms_are_written_and_named(command, toy_run, monkeypatch, furnis
     assert (status, out) == (0, "Wrote 7 rooms to some (from: paper)\n")
     last = errors.strip().splitlines()[-1]
     assert last == f"Note: {note} Train longer, or on more rooms."
-
-
-def test_a_sampler_s_rooms_have_no_latents(command, sampler_run, tmp_path, few_attempts):
-    call = ["synthesize", "--run", sampler_run, "-n", 2]
-    assert command(*call, "--out", "drawn")[0] == 0
-    assert command(*call, "--out", "decoded", "--distribution", "paper")[0] == 0
-    assert not (tmp_path / "drawn" / "latents.npz").exists()
-    assert (tmp_path / "decoded" / "latents.npz").exists()
-    assert (tmp_path / "drawn" / "seed0_0001.json").exists()
 
 
 def test_interpolate(command, toy_run, rooms, tmp_path):
@@ -162,12 +144,10 @@ def packed(command, sampler_run, tmp_path):
     return tmp_path / "mine.prior"
 
 
-def test_scores_of_a_packed_prior(command, packed, toy_shards, tmp_path, monkeypatch, few_attempts):
-    without_classifiers(monkeypatch)
-    call = ["eval-fid", "--run", "mine.prior", "-n", 3, "--resamples", 0, "--out", "s.json"]
-    status, _, errors = command(*call, "--shards", toy_shards)
-    assert status == 0, errors
-    assert json.loads((tmp_path / "s.json").read_text())["protocol"]["run"] == "mine.prior"
+def test_a_packed_prior_stands_for_a_run(command, packed, tmp_path, few_attempts):
+    assert command("synthesize", "--run", "mine.prior", "-n", 2, "--out", "drawn")[0] == 0
+    made = tmp_path / "drawn"
+    assert (made / "seed0_0001.json").exists() and not (made / "latents.npz").exists()
 
 
 def test_pack_says_what_is_missing(command, sampler_run, toy_run, tmp_path):

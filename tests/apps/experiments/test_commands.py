@@ -1,6 +1,5 @@
 """Commands of experiments: what is recorded of one that ends, fails or is stopped."""
 
-import errno
 import json
 import signal
 import subprocess
@@ -65,15 +64,6 @@ def test_a_bug_is_a_sentence_with_its_traceback_in_the_log(tmp_path, monkeypatch
         run_command(MAIN, command, tmp_path, tmp_path / "fit.log")
     assert "Traceback" in (tmp_path / "fit.log").read_text() and torch.get_num_threads() == 1
     assert torch.get_float32_matmul_precision() == before != "medium"
-
-
-def test_a_full_disk_is_a_sentence_with_advice(tmp_path, capsys):
-    def main(arguments):
-        raise OSError(errno.ENOSPC, "No space left on device", "scores.json")
-
-    with pytest.raises(InputError, match=r"No space left on device.*free space on its disk"):
-        run_command(main, Command("fit", ["fit"], tmp_path / "no", []), tmp_path)
-    assert "Traceback" not in capsys.readouterr().err
 
 
 def test_lightning_keeps_no_closed_log():

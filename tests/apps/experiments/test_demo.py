@@ -45,16 +45,12 @@ def run(out: Path, called: list[list[str]], **changes) -> list[str]:
     return [arguments[0] for arguments in called]
 
 
-def test_finished_steps_are_not_repeated(ran, tmp_path, capsys):
+def test_finished_steps_are_not_repeated_and_their_costs_are_scores(ran, tmp_path, capsys):
     assert run(tmp_path, ran[0]) == COMMANDS
     said = capsys.readouterr().err
     assert said.splitlines()[0] == f"$ sceneprior make-homes {tmp_path}/homes --rooms 20 --seed 0"
     assert run(tmp_path, ran[0]) == []
     assert "fit: done before, 2 s\n" in capsys.readouterr().err
-
-
-def test_the_page_lists_the_commands_and_the_scores_their_costs(ran, tmp_path):
-    run(tmp_path, ran[0])
     told = [command.split()[:2] for command in finished_commands(tmp_path)]
     assert told == [["sceneprior", c] for c in COMMANDS]
     scores = json.loads((tmp_path / "scores.json").read_text())

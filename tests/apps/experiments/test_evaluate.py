@@ -8,7 +8,6 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
-from refusals import refused
 
 from sceneprior.apps.config import load_run
 from sceneprior.apps.experiments.evaluate import mask_scores
@@ -62,35 +61,6 @@ def test_a_run_whose_rooms_are_copies_is_warned_of_wherever_it_draws(command, to
     assert status == 0 and errors.count(COPIES) == 1
     page = (tmp_path / "run" / "report.html").read_text()
     assert "learns from masks in 2D; rooms drawn by: kernel, copies: near training rooms" in page
-
-
-REFUSED = {
-    "nothing": "eval-fid",
-    "two_sources": "eval-fid --run a --scenes b",
-    "no_shards": "eval-fid --scenes b",
-    "distribution_of_scenes": "eval-fid --scenes b --shards c --distribution paper",
-    "split": "eval-fid --run a --split train",
-    "too_few_scenes": "eval-fid --scenes SCENES --shards SHARDS -n 500 --out s.json",
-    "use_of_nothing": "evaluate",
-    "use_two_sources": "evaluate --scenes . --run x",
-    "use_request": "evaluate --scenes . --floor 4x3",
-    "use_settle": "evaluate --run x --settle some",
-    "report_no_scores": "report --scenes SCENES --shards SHARDS --scores missing.json",
-    "report_other_file": "report --scenes SCENES --shards SHARDS --scores SCENES/room_0.json",
-    "report_seed_of_scenes": "report --scenes SCENES --shards SHARDS --seed 3",
-    "report_of_nothing": "report",
-    "report_no_shards": "report --scenes SCENES",
-    "report_shards_of_run": "report --run a --shards SHARDS",
-}
-
-
-@pytest.mark.parametrize("name", REFUSED)
-def test_what_cannot_be_evaluated_is_one_sentence(command, scenes, toy_shards, tmp_path, name):
-    words = REFUSED[name].replace("SCENES", str(scenes)).replace("SHARDS", str(toy_shards))
-    status, _, errors = command(*words.split())
-    assert status == 2 and list(tmp_path.iterdir()) == []
-    with refused(f"apps/evaluate_{name}", scenes=scenes, shards=toy_shards):
-        raise InputError(errors.removesuffix("\n"))
 
 
 def test_a_run_without_3d_truth_has_a_page_and_scores_from_views(
