@@ -35,11 +35,6 @@ from sceneprior.core.classes import STUFF, label_set
 from sceneprior.core.shards import Shard, list_shards
 
 
-@pytest.fixture
-def rng() -> np.random.Generator:
-    return np.random.default_rng(0)
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
     """Two made homes, their scans, shards of these, and what was printed."""
@@ -50,13 +45,8 @@ def folder(tmp_path_factory) -> Path:
         patch.setattr(sys, "argv", ["made_scans.py", str(path / "homes"), str(out)])
         made_scans.main()
     (path / "printed.txt").write_text(text.getvalue())
-    source = ScanNet(
-        out / "scans",
-        labels=out / "labels.tsv",
-        frame_step=1,
-        train=out / "train.txt",
-        val=out / "val.txt",
-    )
+    lists = {name: out / f"{name}.txt" for name in ("train", "val")}
+    source = ScanNet(out / "scans", labels=out / "labels.tsv", frame_step=1, **lists)
     build_shards(Job(source, path / "shards", workers=1))
     return path
 
@@ -101,13 +91,6 @@ def test_prep_scannet_finds_the_furniture_where_it_stands(folder: Path, homes, s
         assert np.median(np.abs(wrong)) < 0.05
 
 
-def test_the_same_seed_writes_the_same_scan(folder: Path, scans):
-    for path in scans[0].folder.iterdir():
-        if path.suffix != ".zip":  # its members have the time at which they were written
-            first = folder / "out" / "scans" / scans[0].folder.name / path.name
-            assert path.read_bytes() == first.read_bytes()
-
-
 def test_the_last_row_is_the_mean_of_all_objects(folder: Path, scans, labels):
     every = [iou for scan in scans for each in overlaps(scan, labels).values() for iou in each]
     assert np.mean(every) > 0.6
@@ -126,19 +109,6 @@ def test_the_camera_stays_in_the_room_and_out_of_furniture(homes):
         for piece in room.furniture:
             low, high = piece.mesh.vertices_m.min(axis=0), piece.mesh.vertices_m.max(axis=0)
             assert not ((eyes > low) & (eyes < high)).all(axis=1).any()
-
-
-def test_every_object_is_the_middle_of_some_picture(homes):
-    room, _ = homes[0]
-    poses = np.linalg.inv(walk(room, np.random.default_rng(0)))
-    for piece in room.furniture:
-        middle = (
-            np.append(piece.mesh.vertices_m.min(axis=0) + piece.mesh.vertices_m.max(axis=0), 2) / 2
-        )
-        x, y, z, _ = (poses @ middle).T
-        ahead = z > 0
-        # The hand sways by 3 degrees, and the camera tilts by at most 46 degrees.
-        assert np.degrees(np.arctan2(np.hypot(x, y), z))[ahead].min() < 15
 
 
 def test_poses_sway_by_the_given_root_mean_square(rng: np.random.Generator):

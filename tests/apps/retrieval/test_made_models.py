@@ -38,15 +38,11 @@ def test_models_are_closed_fill_their_box_and_have_three_styles(label):
         np.testing.assert_allclose(mesh.vertices_m.max(axis=0), 0.5, atol=1e-12)
         assert np.abs(points).max() <= 0.5
         shapes.add(mesh.faces.tobytes())
+        if label in ("armchair", "chair", "double_bed", "single_bed", "sofa"):
+            # Points above the seat or the mattress lie behind its centre on average.
+            assert np.mean(points[points[:, 1] > 0.3][:, 2]) < -0.1
     assert len(of_class.model_ids) == len(make_variants(0, label))
     assert len(shapes) >= 3
-
-
-@pytest.mark.parametrize("label", ["armchair", "chair", "double_bed", "single_bed", "sofa"])
-def test_backs_are_at_low_z(label):
-    """Points above the seat or the mattress lie behind its centre on average."""
-    for points in made_models().of_class(label).points:
-        assert np.mean(points[points[:, 1] > 0.3][:, 2]) < -0.1
 
 
 def test_a_class_without_tables_has_no_models():

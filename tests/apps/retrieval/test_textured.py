@@ -15,9 +15,8 @@ from sceneprior.apps.retrieval.retrieve import retrieve
 from sceneprior.apps.rooms import write_scenes
 from sceneprior.core.boxes import quarter_rotation
 from sceneprior.core.colliders import closed_components
-from sceneprior.core.contact_resolution import add_supports
 from sceneprior.core.errors import InputWarning
-from sceneprior.core.scene import Mesh, Scene, SceneObject, quarter_turned
+from sceneprior.core.scene import Scene, SceneObject, quarter_turned
 from sceneprior.interchange.export import export_scenes
 from sceneprior.render.model_files import LARGEST_PX
 from sceneprior.render.scene_files import load_scene, save, scene_to_obj
@@ -57,11 +56,7 @@ def models(request, tmp_path):
     folder = tmp_path / "models"
     if request.param == "3D-FUTURE":
         write_sofa(folder / "a" / "raw_model.obj")
-        row = {
-            "model_id": "a",
-            "super-category": "Sofa",
-            "category": "Three-seat / Multi-seat Sofa",
-        }
+        row = {"model_id": "a", "category": "Three-seat / Multi-seat Sofa"}
         (folder / "model_info.json").write_text(json.dumps([row]))
     else:
         path = write_sofa(folder / "sofa" / "own.obj")
@@ -135,20 +130,6 @@ def test_formats_of_glbs_keep_the_images_and_others_class_colours(models, tmp_pa
         assert sum(map(len, images)) == 1
     text, described = scene_to_obj(scene, "room.mtl")
     assert "map_Kd" not in described.decode() and "usemtl" in text
-
-
-def test_parts_follow_their_object_and_feet_are_parts(models):
-    sofa = retrieved(models).objects[0]
-    moved = sofa.moved((1.0, 0.0, 2.0))
-    for part, before in zip(moved.textured, sofa.textured, strict=True):
-        off = part.mesh.vertices_m - before.mesh.vertices_m
-        np.testing.assert_allclose(off, np.tile([1, 0, 2], (len(off), 1)), atol=1e-12)
-    assert retrieved(models).without_meshes().objects[0].textured == ()
-    raised = Mesh(np.add(sofa.mesh.vertices_m, [0, 0.5, 0]), sofa.mesh.faces)
-    leg = trimesh.creation.box(bounds=[[0.45, 0, -0.25], [0.55, 0.6, -0.15]])
-    solids = (raised, Mesh(leg.vertices, leg.faces))
-    standing = add_supports(replace(sofa, solids=solids))
-    assert len(standing.textured) > len(sofa.textured) and standing.textured[-1].material is None
 
 
 def test_models_without_materials_have_class_colours(tmp_path):
