@@ -3,6 +3,7 @@
 import numpy as np
 
 from data_prep.homes.furnish import (
+    Furnisher,
     Offers,
     RoomType,
     along_wall,
@@ -12,7 +13,6 @@ from data_prep.homes.furnish import (
     table_and_seat,
 )
 from data_prep.homes.layout import Piece
-from data_prep.homes.placement import Furnisher
 
 COUNTS = {2: 157, 3: 782, 4: 1731, 5: 2057, 6: 1296, 7: 821, 8: 419, 9: 234, 10: 112, 11: 58,
           12: 21, 13: 7}  # fmt: skip

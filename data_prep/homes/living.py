@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from data_prep.homes.furnish import (
+    Furnisher,
     Offers,
     RoomType,
     along_wall,
@@ -14,7 +15,6 @@ from data_prep.homes.furnish import (
     table_and_seat,
 )
 from data_prep.homes.layout import Layout, Piece, yaw_at
-from data_prep.homes.placement import Furnisher
 
 COUNTS = {4: 40, 5: 65, 6: 90, 7: 110, 8: 120, 9: 120, 10: 110, 11: 95, 12: 78, 13: 60, 14: 44,
           15: 32, 16: 23, 17: 16, 18: 11, 19: 8, 20: 5, 21: 3}  # fmt: skip

@@ -4,14 +4,17 @@ import errno
 import hashlib
 from dataclasses import replace
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 from golden_values import hold
-from homes_on_disk import TYPES, read_rooms
 from refusals import refused
-from shapely.geometry import LineString, Point
 
+from data_prep.front.furnished import ModelBank, Room
+from data_prep.front.houses import read_house
+from data_prep.front.recipe import boxes_m, load_recipe
 from data_prep.homes.bedroom import BEDROOM
 from data_prep.homes.furnish import furnish
 from data_prep.homes.layout import FREE_SHARE
@@ -19,14 +22,28 @@ from data_prep.homes.make import make_homes
 from sceneprior.core.files import only_writer
 from sceneprior.furniture.catalog import make_catalog
 
+TYPES = ("bedroom", "living")
 both_types = pytest.mark.parametrize("room_type", TYPES)
+
+
+def read_rooms(folder: Path, room_type: str) -> list[Room]:
+    """All rooms, read as 3D-FRONT's are."""
+    bank, recipe = ModelBank(folder / "3D-FUTURE-model"), load_recipe(room_type)
+    houses = sorted((folder / "3D-FRONT").glob("*.json"))
+    return [room for house in houses for room in read_house(house, bank, recipe).rooms]
+
+
+def footprint(low_m, high_m):
+    return shapely.box(low_m[0], low_m[2], high_m[0], high_m[2])
 
 
 @pytest.fixture(scope="module", params=TYPES)
 def rooms(request, made_once):
     """Sixty rooms of one type, as read back from disk."""
     folder = made_once(f"homes_{request.param}", lambda f: make_homes(f, 60, request.param, seed=0))
-    return read_rooms(folder, request.param)
+    found = read_rooms(folder, request.param)
+    assert len(found) == 60
+    return found
 
 
 @both_types
@@ -41,11 +58,15 @@ def test_a_seed_writes_the_same_bytes_as_ever(tmp_path, room_type):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["0", "3", "7"]
 
 
-def test_a_longer_run_begins_with_the_same_rooms(rooms, tmp_path):
-    room_type = "living" if "Living" in rooms[0]["type"] else "bedroom"
-    make_homes(tmp_path / "short", 6, room_type, seed=0)
-    short = read_rooms(tmp_path / "short", room_type)
-    assert sum(room in rooms for room in short) >= len(short) - 1  # the last house may be cut
+@both_types
+def test_a_longer_run_begins_with_the_same_houses(tmp_path, room_type):
+    written = []
+    for rooms in (4, 8):
+        make_homes(tmp_path / f"{rooms}", rooms, room_type, seed=0)
+        houses = (tmp_path / f"{rooms}" / "3D-FRONT").glob("*.json")
+        written.append({path.name: path.read_text() for path in houses})
+    short, long = written
+    assert sum(long.get(name) == text for name, text in short.items()) >= len(short) - 1
 
 
 def test_bad_input_is_one_sentence_and_leaves_nothing(tmp_path):
@@ -83,33 +104,27 @@ def test_command_writes_into_an_empty_folder(tmp_path, cli):
     assert names == ["3D-FRONT", "3D-FUTURE-model", "splits"]
 
 
-def test_floor_looks_up_walls_look_in_and_outer_walls_out(rooms):
+def test_walls_look_in_and_no_furniture_stands_before_the_door(rooms):
     for room in rooms:
-        kinds = {"Floor", "Ceiling", "WallInner", "WallOuter", "Door"}
-        assert {m["type"] for m in room["meshes"]} == kinds
-        for mesh in room["meshes"]:
-            points = np.reshape(mesh["xyz"], (-1, 3))[np.reshape(mesh["faces"], (-1, 3))]
-            normal = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
+        assert set(room.shell) == {"floor", "wall", "door", "ceiling"} and not room.notes
+        for kind, triangles in room.shell.items():
+            normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
             normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-            np.testing.assert_allclose(normal, np.reshape(mesh["normal"], (-1, 3))[::3], atol=1e-4)
-            if mesh["type"] in ("Floor", "Ceiling"):
-                assert np.all(normal[:, 1] == (1 if mesh["type"] == "Floor" else -1))
+            if kind in ("floor", "ceiling"):
+                assert np.allclose(normal[:, 1], 1 if kind == "floor" else -1)
                 continue
-            step = points.mean(axis=(0, 1)) + 0.05 * normal[0]
-            inside = room["floor"].contains(Point(step[[0, 2]]))
-            assert inside == (mesh["type"] in ("WallInner", "Door"))
-
-
-def test_a_door_is_in_a_wall_and_no_furniture_stands_before_it(rooms):
-    for room in rooms:
-        (door,) = (mesh for mesh in room["meshes"] if mesh["type"] == "Door")
-        points = np.reshape(door["xyz"], (-1, 3))
-        base = LineString(np.unique(points[points[:, 1] == 0][:, [0, 2]], axis=0))
-        assert base.length == pytest.approx(0.9) and points[:, 1].max() == 2.0
-        assert max(room["floor"].exterior.distance(Point(xy)) for xy in base.coords) < 0.006
+            steps = triangles.mean(axis=1) + 0.05 * normal
+            assert shapely.covers(room.floor, shapely.points(steps[:, [0, 2]])).all()
+        points = room.shell["door"].reshape(-1, 3)
+        assert points[:, 1].max() == pytest.approx(2.0, abs=1e-4)
+        low, high = points[:, [0, 2]].min(axis=0), points[:, [0, 2]].max(axis=0)
+        base = shapely.LineString([low, high])
+        assert base.length == pytest.approx(0.9, abs=1e-4)
+        assert max(room.floor.exterior.distance(shapely.Point(end)) for end in (low, high)) < 0.006
         before = base.buffer(0.3, cap_style="flat")
-        standing = [p["footprint"] for p in room["pieces"] if p["levels"][0] < 0.5]
-        assert not any(before.intersection(piece).area > 1e-6 for piece in standing)
+        for low_m, high_m in boxes_m(room):
+            if low_m[1] < 0.5:
+                assert before.intersection(footprint(low_m, high_m)).area < 1e-6
 
 
 def test_a_room_for_which_no_place_is_found_is_an_error():
@@ -121,32 +136,25 @@ def test_a_room_for_which_no_place_is_found_is_an_error():
         furnish(hopeless, catalog, np.random.default_rng(0), 0.5)
 
 
-CEILING_CLASSES = {"pendant_lamp", "ceiling_lamp"}
-
-
-def test_no_boxes_intersect_and_all_stand_inside(rooms):
+def test_boxes_stand_apart_and_inside_with_room_to_walk(rooms):
+    side, most = (12, 21) if "Living" in rooms[0].type else (6, 13)
     for room in rooms:
-        for a, b in combinations(room["pieces"], 2):
-            if min(a["levels"][1], b["levels"][1]) - max(a["levels"][0], b["levels"][0]) > 1e-4:
-                assert a["footprint"].intersection(b["footprint"]).area == 0, room["id"]
-        inside = room["floor"].buffer(1e-4)  # coordinates are rounded to 1e-5
-        for piece in room["pieces"]:
-            assert inside.contains(piece["footprint"]), (room["id"], piece["class"])
-            assert piece["levels"][1] <= room["height"] + 1e-3
-            if piece["class"] in CEILING_CLASSES:
-                assert piece["levels"][1] == pytest.approx(room["height"], abs=1e-3)
-                assert piece["levels"][0] > 1.0
-            else:
-                assert piece["levels"][0] == pytest.approx(0, abs=1e-4)
-
-
-def test_rooms_have_room_to_walk_and_pass_atiss_filters(rooms):
-    side, most = (12, 21) if "Living" in rooms[0]["type"] else (6, 13)
-    for room in rooms:
-        x0, z0, x1, z1 = room["floor"].bounds
-        assert max(x1 - x0, z1 - z0) <= side
-        assert 2.6 <= room["height"] <= 3.0
-        assert 2 <= len(room["pieces"]) <= most
-        assert room["floor"].area == pytest.approx(room["size"], abs=0.01)
-        standing = [p["footprint"].area for p in room["pieces"] if p["levels"][0] < 0.5]
-        assert sum(standing) <= (1 - FREE_SHARE) * room["floor"].area + 1e-3
+        x0, z0, x1, z1 = room.floor.bounds
+        assert max(x1 - x0, z1 - z0) <= side and 2.6 <= room.height_m <= 3.0
+        assert 2 <= len(room.furniture) <= most
+        boxes = boxes_m(room)
+        inside = room.floor.buffer(1e-4)  # coordinates are rounded to 1e-5
+        for (low, high), piece in zip(boxes, room.furniture, strict=True):
+            assert inside.contains(footprint(low, high)), (room.room_id, piece.label)
+            assert high[1] <= room.height_m + 1e-3
+            hangs = piece.label in ("pendant_lamp", "ceiling_lamp")
+            end, level = (high[1], room.height_m) if hangs else (low[1], 0)
+            assert end == pytest.approx(level, abs=1e-3) and low[1] > hangs - 1e-3
+        for (low_a, high_a), (low_b, high_b) in combinations(boxes, 2):
+            assert (np.minimum(high_a, high_b) - np.maximum(low_a, low_b)).min() < 1e-4
+        standing = [
+            shapely.MultiPoint(piece.mesh.vertices_m[:, [0, 2]]).convex_hull.area
+            for (low, _), piece in zip(boxes, room.furniture, strict=True)
+            if low[1] < 0.5
+        ]
+        assert sum(standing) <= (1 - FREE_SHARE) * room.floor.area + 1e-3
