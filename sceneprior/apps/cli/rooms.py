@@ -158,9 +158,12 @@ def reconstruct(
 ) -> None:
     """Reconstruct rooms from the instance masks of single images: JSON, GLB and pictures."""
     from sceneprior.apps.api import load
-    from sceneprior.apps.reconstruction.export import write_page, write_reconstructions
     from sceneprior.apps.reconstruction.own_image import read_own_image
-    from sceneprior.apps.reconstruction.reconstruct import OBJECTS
+    from sceneprior.apps.reconstruction.reconstruct import (
+        OBJECTS,
+        write_page,
+        write_reconstructions,
+    )
     from sceneprior.core.boxes import QUARTERS
     from sceneprior.core.views import image_from_shards, images_of_split
 

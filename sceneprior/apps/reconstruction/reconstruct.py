@@ -1,23 +1,40 @@
-"""Reconstruct rooms from instance masks of single images: object by object, or by latents."""
+"""Reconstruct rooms from instance masks of single images, object by object or by latents, and write
+scenes, and pictures of the masks next to the result."""
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
+from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
+from sceneprior.apps.rooms import PAGE_FILE, clear_scenes, write_scene
 from sceneprior.core.boxes import box_corners
-from sceneprior.core.cameras import boxes_of_points
+from sceneprior.core.cameras import Pinhole, boxes_of_points, pixel_rays
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
+from sceneprior.core.files import write_whole
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.views import ObservedImage, SceneViews, as_views, rows_of
+from sceneprior.evaluation.page import png_uri, write_rooms_page
 from sceneprior.lifted.reconstruction.objects import answer_images
 from sceneprior.paper.fit_image import SCHEDULES, fit_latents_to_images, refuse_crowds, view_loss
 from sceneprior.paper.prior import TrainedPrior
 from sceneprior.paper.sampling import scene_of, with_training_latents
+from sceneprior.render.appearance import (
+    contact_sheet,
+    object_colors,
+    paint_ids,
+    png_bytes,
+    quiet_colors,
+    scene_meshes,
+)
+from sceneprior.render.offscreen import SoftwareRenderer
+from sceneprior.render.topdown import topdown, topdown_protocol
 from sceneprior.training.method import Trained, TrainedReconstructor
 
 BATCH = 128
@@ -27,6 +44,16 @@ OBJECTS = "objects"
 schedule (`SCHEDULES`) with which a latent is fitted."""
 START_BATCH = 256
 """Number of training rooms decoded at once."""
+
+HEIGHT_PX = 360
+"""Height of each panel, to which masks are scaled."""
+GAP_PX, LINE_PX, COLUMN_PX = 8, 24, 170
+"""Gap between panels; height and width of an entry of the legend."""
+PAPER, INK = (255, 255, 255), (40, 40, 40)
+MARGIN_M = 0.3
+"""Smallest margin around the camera in the top view."""
+SIGHT_M = 0.8
+"""Length of the lines that show the field of view in the top view."""
 
 
 @dataclass(frozen=True)
@@ -98,15 +125,21 @@ def reconstruct(
             Reconstruction(image, answer.scene, answer.energy, taken_for=answer.taken_for)
             for image, answer in zip(images, answer_images(trained, images), strict=True)
         ]
+    # Batches of images of one size with similar numbers of objects, to limit padding.
+    by_size: dict[tuple[int, ...], list[int]] = defaultdict(list)
+    for row in sorted(range(len(images)), key=lambda row: len(images[row].object_class)):
+        by_size[images[row].instance_ids.shape].append(row)
+    most = max(BATCH // options.restarts, 1)
     found: dict[int, Reconstruction] = {}
-    for rows in _batches(images, max(BATCH // options.restarts, 1)):
-        part = [images[row] for row in rows]
-        if isinstance(trained, TrainedReconstructor):
-            answers = _found_directly(trained, part)
-        else:
-            assert isinstance(trained, TrainedPrior), "checked above: it remembers rooms"
-            answers = _reconstruct_batch(trained, part, options)
-        found |= zip(rows, answers, strict=True)
+    for size in by_size.values():
+        for rows in (size[at : at + most] for at in range(0, len(size), most)):
+            part = [images[row] for row in rows]
+            if isinstance(trained, TrainedReconstructor):
+                answers = _found_directly(trained, part)
+            else:
+                assert isinstance(trained, TrainedPrior), "checked above: it remembers rooms"
+                answers = _fitted(trained, part, options)
+            found |= zip(rows, answers, strict=True)
     return [found[row] for row in range(len(images))]
 
 
@@ -135,52 +168,35 @@ def _found_directly(
     return answers
 
 
-def _batches(images: Sequence[ObservedImage], most: int) -> Iterator[list[int]]:
-    """Batches of images of one size with similar numbers of objects, to limit padding."""
-    by_size: dict[tuple[int, ...], list[int]] = defaultdict(list)
-    for row in sorted(range(len(images)), key=lambda row: len(images[row].object_class)):
-        by_size[images[row].instance_ids.shape].append(row)
-    for rows in by_size.values():
-        yield from (rows[at : at + most] for at in range(0, len(rows), most))
-
-
-def _reconstruct_batch(
+def _fitted(
     trained: TrainedPrior, images: Sequence[ObservedImage], options: FitOptions
 ) -> list[Reconstruction]:
-    views = as_views(images, trained.config.data.mask_step)
+    """Latents fitted to images of one size, from the training rooms with the lowest layout losses
+    on each."""
+    views, labels = as_views(images, trained.config.data.mask_step), trained.config.label_set
     refuse_crowds(trained, views)
-    starts = starting_latents(trained, views, options.restarts)
-    repeated = rows_of(views, torch.arange(len(images)).repeat_interleave(options.restarts))
-    schedule = SCHEDULES[options.fit]
-    fit = fit_latents_to_images(trained, repeated, starts.flatten(0, 1), schedule, options.masks)
-    best = fit.loss.score.reshape(len(images), -1).argmin(dim=1)
-    rows = best + options.restarts * torch.arange(len(images))
-    labels = trained.config.label_set
-
-    def answer(image: ObservedImage, row: int) -> Reconstruction:
-        predictions = fit.loss.matches.prediction[row, : len(image.object_class)].tolist()
-        scene = scene_of(fit.scenes, row, predictions, trained.prior, labels, image.name)
-        compared = options.masks and fit.scenes.vertices_m is not None
-        mask_iou = float(fit.loss.mask_iou[row]) if compared else None
-        return Reconstruction(
-            image, scene, float(fit.loss.score[row]), mask_iou, int(fit.steps[row])
-        )
-
-    return [answer(image, row) for image, row in zip(images, rows.tolist(), strict=True)]
-
-
-def starting_latents(
-    trained: TrainedPrior, views: SceneViews, count: int
-) -> Float[Tensor, "images count width"]:
-    """For each image, the latents of the training rooms with the lowest layout loss on it."""
-    if count > len(trained.logits):
+    if options.restarts > len(trained.logits):
         raise InputError(
-            f"{count} restarts need as many training rooms, but the run has "
+            f"{options.restarts} restarts need as many training rooms, but the run has "
             f"{len(trained.logits)}; use fewer restarts."
         )
     losses = layout_losses_of_rooms(trained, views)
-    nearest = losses.topk(count, dim=1, largest=False).indices
-    return trained.prior.latent_space(trained.logits)[nearest]
+    nearest = losses.topk(options.restarts, dim=1, largest=False).indices
+    starts = trained.prior.latent_space(trained.logits)[nearest]
+    repeated = rows_of(views, torch.arange(len(images)).repeat_interleave(options.restarts))
+    schedule = SCHEDULES[options.fit]
+    fit = fit_latents_to_images(trained, repeated, starts.flatten(0, 1), schedule, options.masks)
+    compared = options.masks and fit.scenes.vertices_m is not None
+    best = fit.loss.score.reshape(len(images), -1).argmin(dim=1)
+    rows = best + options.restarts * torch.arange(len(images))
+    answers = []
+    for image, row in zip(images, rows.tolist(), strict=True):
+        predictions = fit.loss.matches.prediction[row, : len(image.object_class)].tolist()
+        scene = scene_of(fit.scenes, row, predictions, trained.prior, labels, image.name)
+        mask_iou = float(fit.loss.mask_iou[row]) if compared else None
+        score, steps = float(fit.loss.score[row]), int(fit.steps[row])
+        answers.append(Reconstruction(image, scene, score, mask_iou, steps))
+    return answers
 
 
 @torch.no_grad()
@@ -202,3 +218,104 @@ def layout_losses_of_rooms(
         return torch.cat(losses)
 
     return torch.stack([losses_of(image) for image in range(len(views.is_object))])
+
+
+def write_reconstructions(found: Sequence[Reconstruction], folder: Path) -> None:
+    """Write `<name>.json`, `.glb` and `.png`, and `<name>_seen.png`, for each image.
+
+    The JSON's `extra` holds the image's room and view, its camera, and the scores of the fit.
+    """
+    clear_scenes(folder)
+    for one in found:
+        image = one.image
+        extra = {
+            "room_id": image.room_id,
+            "view": image.view,
+            "world_to_camera": image.world_to_camera.tolist(),
+            "intrinsics": image.intrinsics.tolist(),
+            "image_size": list(image.instance_ids.shape),
+            "score": round(one.score, 5),
+            "mask_iou": None if one.mask_iou is None else round(one.mask_iou, 4),
+            "steps": one.steps,
+            "taken_for": one.taken_for,
+        }
+        write_whole(Path(folder) / f"{image.name}_seen.png", png_bytes(_picture(one)))
+        write_scene(replace(one.scene, extra=extra), folder, image.name)
+
+
+def write_page(found: Reconstruction, folder: Path) -> None:
+    """Write `rooms.html` to the folder of `write_reconstructions`."""
+    seen = png_uri(Image.fromarray(_picture(found)))
+    write_rooms_page(
+        Path(folder) / PAGE_FILE,
+        [found.scene],
+        title=found.image.name,
+        subtitle="A room from the masks of one image",
+        pictures=[("The masks, the reconstruction from the same camera, and from above", seen)],
+    )
+
+
+def _picture(found: Reconstruction) -> UInt8[np.ndarray, "height width 3"]:
+    """Three panels (masks, camera view, top view) with titles and a legend, coloured by class."""
+    image, scene = found.image, found.scene
+    names = label_set(image.label_set)
+    colors = quiet_colors(names)
+    camera = Pinhole(image.world_to_camera.astype(np.float64), image.intrinsics.astype(np.float64))
+    panels = {
+        "masks given": paint_ids(
+            image.instance_ids.astype(np.int64), colors[image.object_class], PAPER
+        ),
+        "found, same camera": SoftwareRenderer().shaded(
+            scene_meshes(scene), object_colors(scene), camera, image.instance_ids.shape
+        ),
+        "found, from above": _from_above(scene, image),
+    }
+    scaled = []
+    for panel in panels.values():
+        width = max(round(panel.shape[1] * HEIGHT_PX / panel.shape[0]), 1)
+        size = (width, HEIGHT_PX)
+        scaled.append(np.asarray(Image.fromarray(panel).resize(size, Image.Resampling.NEAREST)))
+    sheet = contact_sheet(scaled, 3, list(panels), GAP_PX)
+    shown = {names[index] for index in image.object_class} | {each.label for each in scene.objects}
+    rows = [index for index, name in enumerate(names) if name in shown]
+    return np.concatenate([sheet, _legend([names[row] for row in rows], colors[rows], sheet)])
+
+
+def _legend(
+    names: Sequence[str],
+    colors: UInt8[np.ndarray, "classes 3"],
+    above: UInt8[np.ndarray, "_ width 3"],
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Colours of classes, in columns below a picture of the same width."""
+    columns = max(above.shape[1] // COLUMN_PX, 1)
+    legend = Image.new("RGB", (above.shape[1], LINE_PX * -(-len(names) // columns)), PAPER)
+    draw, font = ImageDraw.Draw(legend), ImageFont.load_default(14)
+    for place, (name, color) in enumerate(zip(names, colors.tolist(), strict=True)):
+        y, x = LINE_PX * (place // columns), COLUMN_PX * (place % columns) + GAP_PX
+        draw.rectangle((x, y + 6, x + 12, y + 18), tuple(color))
+        draw.text((x + 17, y + 3), name, INK, font)
+    return np.asarray(legend)
+
+
+def _from_above(scene: Scene, image: ObservedImage) -> UInt8[np.ndarray, "height width 3"]:
+    """Top-down picture of the reconstruction, with the camera and its field of view."""
+    eye = image.eye_m
+    reach_m = [np.abs(scene.centers_m) + scene.sizes_m / 2, np.abs(eye) + MARGIN_M]
+    widest_m = 2 * float(np.concatenate([part.reshape(-1, 3) for part in reach_m])[:, [0, 2]].max())
+    protocol = topdown_protocol(scene.label_set)
+    window_m = max(protocol.window_m, widest_m)  # unlike in metrics, nothing is cut off
+    protocol = replace(protocol, image_size=(HEIGHT_PX, HEIGHT_PX), window_m=window_m)
+    plan = Image.fromarray(topdown(scene, protocol, outlines=True))
+
+    def pixel(point_m: np.ndarray) -> tuple[float, float]:
+        x, z = point_m[[0, 2]] / protocol.metres_per_pixel + HEIGHT_PX / 2
+        return float(x), float(z)
+
+    draw = ImageDraw.Draw(plan)
+    middle = image.intrinsics[1, 2]
+    sides = np.array([[0, middle], [image.instance_ids.shape[1], middle]])
+    for ray in pixel_rays(sides, image.world_to_camera, image.intrinsics):
+        draw.line((pixel(eye), pixel(eye + SIGHT_M * ray)), INK, 2)
+    x, y = pixel(eye)
+    draw.ellipse((x - 4, y - 4, x + 4, y + 4), INK)
+    return np.asarray(plan)

@@ -7,6 +7,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.table import Table
 
 from sceneprior.apps.config import load_any_run
@@ -25,11 +26,7 @@ from sceneprior.evaluation.view_scores import (
     score_views,
     surface_note,
 )
-from sceneprior.lifted.reconstruction.known_rooms import (
-    known_rooms,
-    nearest_answers,
-    random_answers,
-)
+from sceneprior.lifted.reconstruction.known_rooms import KnownRooms
 from sceneprior.render.offscreen import SoftwareRenderer
 from sceneprior.render.scene_files import load_scene_folder
 
@@ -60,11 +57,11 @@ def evaluate_run(
     run: str,
     shards: Path,
     options: FitOptions,
-    split: str = "test",
-    seed: int = 0,
-    count: int = 1,
-    limit: int | None = None,
-    models: Path | None = None,
+    split: str,
+    seed: int,
+    count: int,
+    limit: int | None,
+    models: Path | None,
 ) -> dict[str, Any]:
     """Reconstruct views of the rooms of a split and score them against their 3D ground truth.
 
@@ -94,50 +91,28 @@ def evaluate_run(
     if overlaps:
         plain = reconstruct(trained, images, replace(options, masks=False))
         answers["layout_fit"] = [one.scene.without_meshes().objects for one in plain]
-    return {
-        "rows": score_answers(images, answers, shards, split, seed),
+    protocol = {
+        "run": Path(run).resolve().name,
+        "stage": trained.stage,
+        "views": "drawn at random from those that show an object",
+        "views_per_room": count,
+        "rooms_without_such_a_view": blank,
+        "fit": asdict(options),
+        "models": None if models is None else Path(models).resolve().name,
+    }
+    more = {
         "mask_iou": sum(overlaps) / len(overlaps) if overlaps else None,
         "cpu_seconds_an_image": seconds / len(images),
-        "protocol": {
-            "run": Path(run).resolve().name,
-            "stage": trained.stage,
-            "views": "drawn at random from those that show an object",
-            "views_per_room": count,
-            "rooms_without_such_a_view": blank,
-            "fit": asdict(options),
-            "models": None if models is None else Path(models).resolve().name,
-            **_protocol(images, shards, split, seed),
-        },
     }
+    return _scored(images, answers, shards, split, seed, protocol, more)
 
 
-def evaluate_scenes(
-    folder: Path, shards: Path, split: str = "test", seed: int = 0
-) -> dict[str, Any]:
+def evaluate_scenes(folder: Path, shards: Path, split: str, seed: int) -> dict[str, Any]:
     """Score a folder of reconstructions, as written by `reconstruct` or by `retrieve` after it.
 
     Each scene's `extra` holds its `room_id` and `view`; its objects correspond to the masks of that
     view, in their order.
     """
-    images, scenes = scenes_with_images(folder, shards, split)
-    answers: dict[str, Answers] = {
-        "scenes": [scene.objects for scene in scenes],
-        "scenes_boxes": [scene.without_meshes().objects for scene in scenes],
-    }
-    return {
-        "rows": score_answers(images, answers, shards, split, seed),
-        "protocol": {
-            "scenes": str(folder),
-            "views": {image.name: image.view for image in images},
-            **_protocol(images, shards, split, seed),
-        },
-    }
-
-
-def scenes_with_images(
-    folder: Path, shards: Path, split: str
-) -> tuple[list[ObservedImage], list[Scene]]:
-    """The scenes of a folder, each with its input view; see `evaluate_scenes`."""
     of_room: dict[str, list[Scene]] = defaultdict(list)
     for scene in load_scene_folder(folder):
         room = scene.extra.get("room_id")
@@ -166,61 +141,54 @@ def scenes_with_images(
             f"The '{split}' split of {shards} has no room {', '.join(sorted(of_room)[:3])}, but "
             f"{folder} has scenes of it; name the split or the shards that the scenes come from."
         )
-    return images, scenes
+    answers: dict[str, Answers] = {
+        "scenes": [scene.objects for scene in scenes],
+        "scenes_boxes": [scene.without_meshes().objects for scene in scenes],
+    }
+    protocol = {"scenes": str(folder), "views": {image.name: image.view for image in images}}
+    return _scored(images, answers, shards, split, seed, protocol, {})
 
 
-def _protocol(
-    images: Sequence[ObservedImage], shards: Path, split: str, seed: int
+def _scored(
+    images: Sequence[ObservedImage],
+    answers: dict[str, Answers],
+    shards: Path,
+    split: str,
+    seed: int,
+    protocol: dict[str, Any],
+    more: dict[str, Any],
 ) -> dict[str, Any]:
-    """The settings of a result file that scores of runs and of scenes share."""
-    return {
-        "known_model_share": known_model_share(images, shards, split),
+    """A result file: scores by row, of the given reconstructions and of training rooms as
+    baselines, and the settings."""
+    rooms, renderer, rng = KnownRooms(shards), SoftwareRenderer(), np.random.default_rng(seed)
+    answers = {
+        **answers,
+        "nearest_room": [rooms.nearest(image, renderer).objects for image in images],
+        "random_room": [rooms.drawn(image, rng).objects for image in images],
+    }
+    true_rooms = reference_scenes(shards, split, tracked_only=True)
+    truth = {scene.name: scene.objects for scene in true_rooms}
+    shown = [[truth[image.room_id][row] for row in image.rows] for image in images]
+    room_ids = [image.room_id for image in images]
+    rows = {}
+    for name, some in answers.items():
+        views = [[*zip(*pair, strict=True)] for pair in zip(shown, some, strict=True)]
+        rows[name] = score_views(views, room_ids)
+    # The share of the objects whose CAD model also occurs in a training room; None if no model is
+    # known. If it is near 1, the scores do not measure unseen furniture.
+    known = {model_id for models in models_of(shards, "train").values() for model_id in models}
+    models = models_of(shards, split)
+    named = [models[image.room_id][row] for image in images for row in image.rows]
+    is_known = [model_id in known for model_id in named if model_id]
+    protocol |= {
+        "known_model_share": sum(is_known) / len(is_known) if is_known else None,
         "shards": str(shards),
         "split": split,
         "seed": seed,
         "points": POINTS,
         **PROTOCOL,
     }
-
-
-def score_answers(
-    images: Sequence[ObservedImage],
-    answers: dict[str, Answers],
-    shards: Path,
-    split: str,
-    seed: int,
-) -> dict[str, Any]:
-    """Scores by row: rows of the given reconstructions, and baseline rows of training rooms."""
-    rooms = known_rooms(shards)
-    nearest = nearest_answers(rooms, images, SoftwareRenderer())
-    drawn = random_answers(rooms, images, seed)
-    answers = {
-        **answers,
-        "nearest_room": [one.objects for one in nearest],
-        "random_room": [one.objects for one in drawn],
-    }
-    true_rooms = reference_scenes(shards, split, tracked_only=True)
-    truth = {scene.name: scene.objects for scene in true_rooms}
-    rows = {}
-    for name, some in answers.items():
-        views = []
-        for image, objects in zip(images, some, strict=True):
-            shown = [truth[image.room_id][row] for row in image.rows]
-            views.append([*zip(shown, objects, strict=True)])
-        rows[name] = score_views(views, [image.room_id for image in images])
-    return rows
-
-
-def known_model_share(images: Sequence[ObservedImage], shards: Path, split: str) -> float | None:
-    """Share of the objects in images whose CAD model also occurs in a training room.
-
-    None if no model is known. If it is near 1, the scores do not measure unseen furniture.
-    """
-    known = {model_id for models in models_of(shards, "train").values() for model_id in models}
-    models = models_of(shards, split)
-    shown = [models[image.room_id][row] for image in images for row in image.rows]
-    named = [model_id in known for model_id in shown if model_id]
-    return sum(named) / len(named) if named else None
+    return {"rows": rows, **more, "protocol": protocol}
 
 
 def print_view_scores(scores: dict[str, Any]) -> None:

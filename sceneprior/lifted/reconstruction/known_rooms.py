@@ -5,7 +5,7 @@ that they are compared with.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -41,30 +41,6 @@ ABSENT_M = 1e4
 """Coordinate of padding, far from every camera."""
 
 
-@dataclass(frozen=True)
-class KnownRooms:
-    """Rooms in 3D, each in four turns, with their objects in the form of decoded predictions.
-
-    Scenes hold boxes only, since a data set's meshes in four turns take many gigabytes; `furnished`
-    reads the meshes of one room.
-    """
-
-    folder: Path
-    paths: tuple[Path, ...]
-    """The shard of each room, before turning."""
-    scenes: tuple[Scene, ...]
-    class_logits: Float[Tensor, "rooms objects classes"]
-    centers_m: Float[Tensor, "rooms objects 3"]
-    sizes_m: Float[Tensor, "rooms objects 3"]
-
-    def furnished(self, row: int) -> Scene:
-        """`scenes[row]` with its meshes."""
-        scene = self.scenes[row]
-        with Shard(self.paths[row // QUARTERS]) as shard:
-            home = reference_scene(shard, scene.name, self.folder)
-        return turn_scene(home, row % QUARTERS)
-
-
 class KnownAnswer(NamedTuple):
     """A known room as the reconstruction of an image."""
 
@@ -73,24 +49,89 @@ class KnownAnswer(NamedTuple):
     """The object for each mask; None if the room has none left for it."""
 
 
-def known_rooms(shards: Path, split: str = "train") -> KnownRooms:
-    """The rooms of a split, each turned by 0, 90, 180 and 270 degrees."""
-    rooms = [
-        (shard.path, reference_scene(shard, room_id, shards, meshes=False))
-        for shard, room_id in iterate_rooms(shards, split)
-    ]
-    turned = tuple(turn_scene(scene, quarter) for _, scene in rooms for quarter in range(QUARTERS))
-    certain = CERTAIN_LOGIT * torch.eye(len(label_set(turned[0].label_set)))
-    centers_m = [torch.from_numpy(scene.centers_m).float() for scene in turned]
-    sizes_m = [torch.from_numpy(scene.sizes_m).float() for scene in turned]
-    return KnownRooms(
-        Path(shards),
-        tuple(path for path, _ in rooms),
-        turned,
-        pad_sequence([certain[scene.class_indices] for scene in turned], True),
-        pad_sequence(centers_m, True, ABSENT_M),
-        pad_sequence(sizes_m, True),
-    )
+class KnownRooms:
+    """The training rooms in 3D, each in four turns, as reconstructions of images.
+
+    Scenes hold boxes only, since a data set's meshes in four turns take many gigabytes; `furnished`
+    reads the meshes of one room.
+    """
+
+    def __init__(self, shards: Path):
+        self._folder = Path(shards)
+        rooms = [
+            (shard.path, reference_scene(shard, room_id, shards, meshes=False))
+            for shard, room_id in iterate_rooms(shards, "train")
+        ]
+        self._paths = [path for path, _ in rooms]
+        self.scenes = [
+            turn_scene(scene, quarter) for _, scene in rooms for quarter in range(QUARTERS)
+        ]
+        """Each room turned by 0, 90, 180 and 270 degrees."""
+        certain = CERTAIN_LOGIT * torch.eye(len(label_set(self.scenes[0].label_set)))
+        self._logits = pad_sequence([certain[scene.class_indices] for scene in self.scenes], True)
+        centers_m = [torch.from_numpy(scene.centers_m).float() for scene in self.scenes]
+        self._centers_m = pad_sequence(centers_m, True, ABSENT_M)
+        sizes_m = [torch.from_numpy(scene.sizes_m).float() for scene in self.scenes]
+        self._sizes_m = pad_sequence(sizes_m, True)
+
+    def furnished(self, row: int) -> Scene:
+        """`scenes[row]` with its meshes."""
+        scene = self.scenes[row]
+        with Shard(self._paths[row // QUARTERS]) as shard:
+            home = reference_scene(shard, scene.name, self._folder)
+        return turn_scene(home, row % QUARTERS)
+
+    def drawn(self, image: ObservedImage, rng: np.random.Generator) -> KnownAnswer:
+        """A random room other than the image's own, matched to its masks."""
+        row = int(rng.choice(self._others(image)))
+        return self._answer(row, self._matched(torch.tensor([row]), image)[0][0])
+
+    def nearest(self, image: ObservedImage, renderer: Renderer) -> KnownAnswer:
+        """The room other than the image's own with the highest mean IoU over the image's masks.
+
+        Masks are rendered only for the `SHORTLIST` rooms that are best by classes and 2D boxes.
+        """
+        others = self._others(image)
+        matched, costs = self._matched(others, image)
+        best = costs.argsort()[:SHORTLIST].tolist()
+        offered = [self._answer(int(others[at]), matched[at]) for at in best]
+        return max(offered, key=lambda one: mask_overlap(one, image, renderer))
+
+    def _answer(self, row: int, matched: Sequence[int]) -> KnownAnswer:
+        scene = self.furnished(row)
+        count = len(scene.objects)
+        return KnownAnswer(scene, tuple(scene.objects[k] if k < count else None for k in matched))
+
+    def _others(self, image: ObservedImage) -> Tensor:
+        rows = [row for row, scene in enumerate(self.scenes) if scene.name != image.room_id]
+        if not rows:
+            raise InputError(
+                f"The shards' only training room is {image.room_id} itself, so there is no other "
+                "to compare its reconstruction with; take shards with more training rooms."
+            )
+        return torch.tensor(rows)
+
+    def _matched(
+        self, rows: Int[Tensor, " rooms"], image: ObservedImage
+    ) -> tuple[list[list[int]], Float[Tensor, " rooms"]]:
+        """For each room, the index of the object assigned to each mask (an index beyond the last
+        object means none), and the mean cost of the assignment."""
+        view = rows_of(as_views([image], 1), torch.zeros(len(rows), dtype=torch.int64))
+        # As many padding objects as there are masks, so that every mask gets an index.
+        masks = view.is_object.shape[1]
+        logits, centers_m, sizes_m = (
+            F.pad(values[rows], (0, 0, 0, masks), value=value)
+            for values, value in (
+                (self._logits, 0.0), (self._centers_m, ABSENT_M), (self._sizes_m, 0.0)
+            )
+        )  # fmt: skip
+        decoded = DecodedScenes(logits, centers_m, sizes_m, torch.zeros(centers_m.shape[:2]))
+        corners = box_corners(centers_m, sizes_m)
+        boxes = boxes_of_points(corners, view.world_to_camera, view.intrinsics, view.image_size)
+        costs = matching_cost(decoded, boxes, view, BOX_WEIGHT, OCCLUSION_SLACK)
+        slots = [costs.shape[1]] * len(rows)  # the objects have no order, so all of them take part
+        chosen = assign(costs, slots, view.is_object.sum(dim=-1).tolist())
+        return chosen.tolist(), costs.gather(1, chosen.unsqueeze(1))[:, 0].mean(dim=1)
 
 
 def turn_scene(scene: Scene, quarter: int) -> Scene:
@@ -108,74 +149,6 @@ def turn_object(item: SceneObject, quarter: int) -> SceneObject:
     center_m, size_m = turn @ np.array(item.center_m), np.abs(turn) @ np.array(item.size_m)
     mesh = item.mesh and Mesh(item.mesh.vertices_m @ turn.T, item.mesh.faces)
     return SceneObject(item.label, tuple(center_m.tolist()), tuple(size_m.tolist()), mesh)
-
-
-def random_answers(
-    rooms: KnownRooms, images: Sequence[ObservedImage], seed: int
-) -> list[KnownAnswer]:
-    """For each image, a random room other than its own, matched to its masks."""
-    rng = np.random.default_rng(seed)
-    rows = [int(rng.choice(_others(rooms, image))) for image in images]
-    return [
-        _answer(rooms, row, _matched(rooms, torch.tensor([row]), image)[0][0])
-        for row, image in zip(rows, images, strict=True)
-    ]
-
-
-def nearest_answers(
-    rooms: KnownRooms, images: Sequence[ObservedImage], renderer: Renderer
-) -> list[KnownAnswer]:
-    """For each image, the room other than its own with the highest mean IoU over the image's masks.
-
-    Masks are rendered only for the `SHORTLIST` rooms that are best by classes and 2D boxes.
-    """
-    answers = []
-    for image in images:
-        others = _others(rooms, image)
-        matched, costs = _matched(rooms, others, image)
-        best = costs.argsort()[:SHORTLIST].tolist()
-        offered = [_answer(rooms, int(others[at]), matched[at]) for at in best]
-        answers.append(max(offered, key=lambda one: mask_overlap(one, image, renderer)))
-    return answers
-
-
-def _answer(rooms: KnownRooms, row: int, matched: Sequence[int]) -> KnownAnswer:
-    scene = rooms.furnished(row)
-    count = len(scene.objects)
-    return KnownAnswer(scene, tuple(scene.objects[k] if k < count else None for k in matched))
-
-
-def _others(rooms: KnownRooms, image: ObservedImage) -> Tensor:
-    rows = [row for row, scene in enumerate(rooms.scenes) if scene.name != image.room_id]
-    if not rows:
-        raise InputError(
-            f"The shards' only training room is {image.room_id} itself, so there is no other to "
-            "compare its reconstruction with; take shards with more training rooms."
-        )
-    return torch.tensor(rows)
-
-
-def _matched(
-    known: KnownRooms, rows: Int[Tensor, " rooms"], image: ObservedImage
-) -> tuple[list[list[int]], Float[Tensor, " rooms"]]:
-    """For each room, the index of the object assigned to each mask (an index beyond the last object
-    means none), and the mean cost of the assignment."""
-    view = rows_of(as_views([image], 1), torch.zeros(len(rows), dtype=torch.int64))
-    # As many padding objects as there are masks, so that every mask gets an index.
-    masks = view.is_object.shape[1]
-
-    def padded(values: Tensor, value: float = 0.0) -> Tensor:
-        return F.pad(values[rows], (0, 0, 0, masks), value=value)
-
-    logits, sizes_m = padded(known.class_logits), padded(known.sizes_m)
-    centers_m = padded(known.centers_m, ABSENT_M)
-    decoded = DecodedScenes(logits, centers_m, sizes_m, torch.zeros(centers_m.shape[:2]))
-    corners = box_corners(centers_m, sizes_m)
-    boxes = boxes_of_points(corners, view.world_to_camera, view.intrinsics, view.image_size)
-    costs = matching_cost(decoded, boxes, view, BOX_WEIGHT, OCCLUSION_SLACK)
-    slots = [costs.shape[1]] * len(rows)  # the objects have no order, so all of them take part
-    chosen = assign(costs, slots, view.is_object.sum(dim=-1).tolist())
-    return chosen.tolist(), costs.gather(1, chosen.unsqueeze(1))[:, 0].mean(dim=1)
 
 
 def mask_overlap(answer: KnownAnswer, image: ObservedImage, renderer: Renderer) -> float:

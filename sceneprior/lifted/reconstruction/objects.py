@@ -6,7 +6,7 @@ difference gives its likelihood; the answer is the candidate whose box has the h
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ from sceneprior.lifted.prototype_decoder import PosedScenes, PrototypeDecoder
 from sceneprior.lifted.reconstruction.known_rooms import turn_object
 from sceneprior.lifted.reconstruction.placing import Outlines, Placed, outlines_of, place_objects
 from sceneprior.paper.losses import kept_objects
-from sceneprior.paper.prior import ScenePrior, TrainedPrior
+from sceneprior.paper.prior import TrainedPrior
 from sceneprior.paper.sampling import scene_of
 
 OF_CLASS = 200
@@ -56,10 +56,6 @@ class Candidates(NamedTuple):
     points: Float[Tensor, "objects points 3"]
     """Points on the surface, in the frame in which the object's box is [-0.5, 0.5]^3."""
 
-    def take(self, rows: Int[Tensor, " rows"]) -> "Candidates":
-        """The candidates of these rows."""
-        return Candidates(*(part[rows] for part in self))
-
 
 class Guesses(NamedTuple):
     """Guesses of the object behind each mask: a candidate in a turn, one per row."""
@@ -68,9 +64,6 @@ class Guesses(NamedTuple):
     """Index of the mask, counted over all images."""
     candidate: Int[Tensor, " guesses"]
     quarter: Int[Tensor, " guesses"]
-
-    def take(self, rows: Tensor) -> "Guesses":
-        return Guesses(*(part[rows] for part in self))
 
 
 class ObjectAnswer(NamedTuple):
@@ -86,31 +79,42 @@ class ObjectAnswer(NamedTuple):
     it."""
 
 
+_Columns = TypeVar("_Columns", Candidates, Guesses, Outlines, Placed)
+
+
+def _rows(columns: _Columns, rows: Tensor) -> _Columns:
+    """These rows of all columns."""
+    return type(columns)(*(part[rows] for part in columns))
+
+
+def _joined(tables: Sequence[_Columns]) -> _Columns:
+    """Tables of the same columns, one after another."""
+    return type(tables[0])(*(torch.cat(parts) for parts in zip(*tables, strict=True)))
+
+
 @torch.no_grad()
 def answer_images(trained: TrainedPrior, images: Sequence[ObservedImage]) -> list[ObjectAnswer]:
     """Reconstruct images of the run's label set in one batch; answers do not depend on each other.
 
     For a class that the run never generates, objects of all classes are tried.
     """
-    outlines = [outlines_of(image) for image in images]
-    masks = Outlines(*(torch.cat(parts) for parts in zip(*outlines, strict=True)))
+    masks = _joined([outlines_of(image) for image in images])
     classes = torch.from_numpy(np.concatenate([image.object_class for image in images]))
     rough = candidates_of(trained)
     first = _of_classes(rough, classes)
-    energy = _placed(rough, first, masks).energy
-    second = _promising(first, energy, len(classes))
+    second = _promising(first, _placed(rough, first, masks).energy, len(classes))
     used, numbered = second.candidate.unique(return_inverse=True)
-    shaped = with_shapes(trained, rough.take(used))
+    shaped = _with_shapes(trained, _rows(rough, used))
     second = second._replace(candidate=numbered)
     placed = _placed(shaped, second, masks)
     picks, energies = [], []
     for mask in range(len(classes)):
         rows = (second.mask == mask).nonzero()[:, 0]
-        sizes_m = _turned_sizes(shaped, second.take(rows))
-        picks.append(rows[likeliest_box(placed, sizes_m, rows)])
+        sizes_m = _turned_sizes(shaped, _rows(second, rows))
+        picks.append(rows[likeliest_box(_rows(placed, rows), sizes_m)])
         energies.append(placed.energy[rows].min())
     chosen, best = torch.stack(picks), torch.stack(energies)
-    objects = _objects(trained, shaped, second.take(chosen), placed.centers_m[chosen])
+    objects = _objects(trained, shaped, _rows(second, chosen), placed.centers_m[chosen])
     names = label_set(trained.config.label_set)
     known = {names[index] for index in rough.object_class.unique().tolist()}
     answers, at = [], 0
@@ -118,11 +122,8 @@ def answer_images(trained: TrainedPrior, images: Sequence[ObservedImage]) -> lis
         own = slice(at, at + len(image.object_class))
         labels = [names[index] for index in image.object_class]
         pairs = list(zip(labels, objects[own], strict=True))
-        scene = Scene(
-            image.name,
-            image.label_set,
-            tuple(SceneObject(label, o.center_m, o.size_m, o.mesh) for label, o in pairs),
-        )
+        found = tuple(SceneObject(label, o.center_m, o.size_m, o.mesh) for label, o in pairs)
+        scene = Scene(image.name, image.label_set, found)
         taken_for = {label: o.label for label, o in pairs if label not in known}
         answers.append(ObjectAnswer(scene, float(best[own].mean()), taken_for))
         at = own.stop
@@ -133,30 +134,21 @@ def _of_classes(candidates: Candidates, classes: Int[Tensor, " masks"]) -> Guess
     """For each mask, `OF_CLASS` candidates of its class, in quarter turns 0 and 1."""
     generator = torch.Generator().manual_seed(0)
     shuffled = torch.randperm(len(candidates.room), generator=generator)
-    of_class = {
-        index: shuffled[candidates.object_class[shuffled] == index][:OF_CLASS]
-        for index in classes.unique().tolist()
-    }
-    chosen = [
-        rows if len(rows := of_class[index]) else shuffled[:OF_CLASS] for index in classes.tolist()
-    ]
-    counts = torch.tensor([len(rows) for rows in chosen])
-    mask = torch.arange(len(classes)).repeat_interleave(counts)
-    candidate = torch.cat(chosen)
-    quarter = torch.zeros_like(mask)
-    return Guesses(mask.repeat(2), candidate.repeat(2), torch.cat([quarter, quarter + 1]))
+    parts = []
+    for mask, index in enumerate(classes.tolist()):
+        rows = shuffled[candidates.object_class[shuffled] == index][:OF_CLASS]
+        rows = rows if len(rows) else shuffled[:OF_CLASS]
+        parts.append(Guesses(torch.full_like(rows, mask), rows, torch.zeros_like(rows)))
+    level = _joined(parts)
+    return _joined([level, level._replace(quarter=level.quarter + 1)])
 
 
 def _promising(guesses: Guesses, energy: Float[Tensor, " guesses"], masks: int) -> Guesses:
     """The guesses of least energy for each mask, and the same guesses turned by 180 degrees."""
     order = energy.argsort(stable=True)
-    order = order[guesses.mask[order].argsort(stable=True)]
-    counts = guesses.mask.bincount(minlength=masks)
-    first = counts.cumsum(0) - counts
-    rank = torch.arange(len(order)) - first[guesses.mask[order]]
-    best = guesses.take(order[rank < PROMISING])
-    turned = best._replace(quarter=best.quarter + QUARTERS // 2)
-    return Guesses(*(torch.cat(parts) for parts in zip(best, turned, strict=True)))
+    best = [order[guesses.mask[order] == mask][:PROMISING] for mask in range(masks)]
+    level = _rows(guesses, torch.cat(best))
+    return _joined([level, level._replace(quarter=level.quarter + QUARTERS // 2)])
 
 
 def _turned_sizes(candidates: Candidates, guesses: Guesses) -> Float[Tensor, "guesses 3"]:
@@ -166,25 +158,17 @@ def _turned_sizes(candidates: Candidates, guesses: Guesses) -> Float[Tensor, "gu
 def _placed(candidates: Candidates, guesses: Guesses, masks: Outlines) -> Placed:
     parts = []
     for rows in torch.arange(len(guesses.mask)).split(AT_ONCE):
-        part = guesses.take(rows)
+        part = _rows(guesses, rows)
         points = turn_vectors(candidates.points[part.candidate], part.quarter)
-        parts.append(
-            place_objects(
-                points,
-                _turned_sizes(candidates, part),
-                candidates.bottom_m[part.candidate],
-                Outlines(*(values[part.mask] for values in masks)),
-            )
-        )
-    return Placed(*(torch.cat(values) for values in zip(*parts, strict=True)))
+        sizes_m, bottom_m = _turned_sizes(candidates, part), candidates.bottom_m[part.candidate]
+        parts.append(place_objects(points, sizes_m, bottom_m, _rows(masks, part.mask)))
+    return _joined(parts)
 
 
-def likeliest_box(
-    placed: Placed, sizes_m: Float[Tensor, "guesses 3"], rows: Int[Tensor, " guesses"]
-) -> int:
-    """Index into `rows` of the guess whose box has the highest expected IoU with the true box."""
-    likely = (-placed.energy[rows]).double().softmax(dim=0).numpy()
-    centers_m, sizes = (part.double().numpy() for part in (placed.centers_m[rows], sizes_m))
+def likeliest_box(placed: Placed, sizes_m: Float[Tensor, "guesses 3"]) -> int:
+    """Index of the guess whose box has the highest expected IoU with the true box."""
+    likely = (-placed.energy).double().softmax(dim=0).numpy()
+    centers_m, sizes = (part.double().numpy() for part in (placed.centers_m, sizes_m))
     return int((box_iou_3d(centers_m, sizes, centers_m, sizes) @ likely).argmax())
 
 
@@ -199,7 +183,7 @@ def _objects(
     rooms, slots = candidates.room[chosen.candidate], candidates.slot[chosen.candidate]
     for room in rooms.unique():
         mine = slots[rooms == room].unique()
-        decoded = decode_some(trained, room[None], torch.zeros_like(mine), mine)
+        decoded = _decode_some(trained, room[None], torch.zeros_like(mine), mine)
         labels = trained.config.label_set
         scene = scene_of(decoded, 0, mine.tolist(), trained.prior, labels, "")
         pairs = zip(mine.tolist(), scene.objects, strict=True)
@@ -213,7 +197,6 @@ def _objects(
     return found
 
 
-@torch.no_grad()
 def candidates_of(trained: TrainedPrior) -> Candidates:
     """All objects of the decoded training rooms, with beveled boxes as their shapes.
 
@@ -225,20 +208,13 @@ def candidates_of(trained: TrainedPrior) -> Candidates:
         decoded = trained.prior(trained.logits[rows], with_shape=False)
         object_class = decoded.class_logits.argmax(dim=-1)
         kept = kept_objects(decoded.completeness_logits, trained.config.model.completeness_target)
-        room, slot = (kept & (object_class != VOID)).nonzero(as_tuple=True)
-        sizes_m, centers_m = decoded.sizes_m[room, slot], decoded.centers_m[room, slot]
+        room, slot = at = (kept & (object_class != VOID)).nonzero(as_tuple=True)
+        sizes_m = decoded.sizes_m[at]
+        bottom_m = decoded.centers_m[at][:, 1] - sizes_m[:, 1] / 2
         assert decoded.bevels is not None, "decode() gives every object bevels"
-        parts.append(
-            Candidates(
-                rows[room],
-                slot,
-                object_class[room, slot],
-                centers_m[:, 1] - sizes_m[:, 1] / 2,
-                sizes_m,
-                beveled_cube(decoded.bevels[room, slot]) / 2,
-            )
-        )
-    found = Candidates(*(torch.cat(part) for part in zip(*parts, strict=True)))
+        points = beveled_cube(decoded.bevels[at]) / 2
+        parts.append(Candidates(rows[room], slot, object_class[at], bottom_m, sizes_m, points))
+    found = _joined(parts)
     if not len(found.room):
         raise InputError(
             f"The run decodes all its {len(trained.logits)} training rooms as empty rooms, so "
@@ -248,22 +224,31 @@ def candidates_of(trained: TrainedPrior) -> Candidates:
     return found
 
 
-@torch.no_grad()
-def with_shapes(trained: TrainedPrior, candidates: Candidates) -> Candidates:
-    """The candidates with points of their decoded shapes; unchanged before the shape stage."""
+def _with_shapes(trained: TrainedPrior, candidates: Candidates) -> Candidates:
+    """The candidates with points of their decoded shapes, the furthest in each of a few directions;
+    unchanged before the shape stage."""
     if trained.stage == "layout" or not len(candidates.room):
         return candidates
     directions = icosphere(POINTS_LEVEL)[0].to(candidates.points)
     points = candidates.points.new_empty(len(candidates.room), len(directions), 3)
     for rooms in candidates.room.unique().split(ROOMS):
         mine = torch.isin(candidates.room, rooms).nonzero()[:, 0]
-        row, slot = torch.searchsorted(rooms, candidates.room[mine]), candidates.slot[mine]
-        decoded = decode_some(trained, rooms, row, slot)
-        points[mine] = _furthest(decoded, row, slot, directions, trained.prior)
+        at = torch.searchsorted(rooms, candidates.room[mine]), candidates.slot[mine]
+        decoded = _decode_some(trained, rooms, *at)
+        if decoded.vertices_m is not None:
+            away = decoded.vertices_m[at] - decoded.centers_m[at].unsqueeze(1)
+            surfaces = list(away / decoded.sizes_m[at].clamp(min=1e-6).unsqueeze(1))
+        else:
+            assert isinstance(decoded, PosedScenes) and decoded.looks is not None
+            shapes = trained.prior.shape
+            assert isinstance(shapes, PrototypeDecoder)
+            meshes = [shapes.mesh(look, UNIT_BOX) for look in decoded.looks[at].tolist()]
+            surfaces = [torch.from_numpy(mesh.vertices_m).to(directions) for mesh in meshes]
+        points[mine] = torch.stack([s[(s @ directions.T).argmax(dim=0)] for s in surfaces])
     return candidates._replace(points=points)
 
 
-def decode_some(
+def _decode_some(
     trained: TrainedPrior,
     rooms: Int[Tensor, " rooms"],
     row: Int[Tensor, " objects"],
@@ -275,22 +260,3 @@ def decode_some(
     wanted[row, slot] = True
     z = trained.prior.latent_space(trained.logits[rooms])
     return trained.prior.decode(z, trained.stage != "layout", wanted)
-
-
-def _furthest(
-    decoded: DecodedScenes,
-    row: Int[Tensor, " objects"],
-    slot: Int[Tensor, " objects"],
-    directions: Float[Tensor, "directions 3"],
-    prior: ScenePrior,
-) -> Float[Tensor, "objects directions 3"]:
-    if decoded.vertices_m is not None:
-        sizes_m = decoded.sizes_m[row, slot].clamp(min=1e-6)
-        away = decoded.vertices_m[row, slot] - decoded.centers_m[row, slot].unsqueeze(1)
-        surfaces = list(away / sizes_m.unsqueeze(1))
-    else:
-        assert isinstance(decoded, PosedScenes) and decoded.looks is not None
-        assert isinstance(prior.shape, PrototypeDecoder)
-        meshes = [prior.shape.mesh(look, UNIT_BOX) for look in decoded.looks[row, slot].tolist()]
-        surfaces = [torch.from_numpy(mesh.vertices_m).to(directions) for mesh in meshes]
-    return torch.stack([each[(each @ directions.T).argmax(dim=0)] for each in surfaces])

@@ -6,7 +6,7 @@ import pytest
 from golden_values import assert_as_before
 from refusals import refused
 
-from sceneprior.apps.reconstruction.score import evaluate_scenes, scenes_with_images
+from sceneprior.apps.reconstruction.score import evaluate_scenes
 from sceneprior.apps.rooms import write_scenes
 from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.views import images_of_split
@@ -29,7 +29,7 @@ def answers(toy_shards, tmp_path):
 
 def test_scores_are_as_before(answers, toy_shards):
     _, folder = answers
-    found = evaluate_scenes(folder, toy_shards)
+    found = evaluate_scenes(folder, toy_shards, "test", 0)
     assert found["protocol"].pop("scenes") == str(folder)
     assert found["protocol"].pop("shards") == str(toy_shards)
     assert_as_before("apps/svr_scores", found, rel=1e-3, abs=1e-4)
@@ -45,4 +45,4 @@ def test_scenes_that_do_not_match_an_image_are_refused(answers, toy_shards, tmp_
         folder = tmp_path / name
         write_scenes([replace(first, **changed)], folder)
         with refused(f"apps/svr_{name}", tmp=tmp_path, shards=toy_shards):
-            scenes_with_images(folder, toy_shards, "test")
+            evaluate_scenes(folder, toy_shards, "test", 0)

@@ -10,17 +10,15 @@ from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.views import images_of_split
 from sceneprior.lifted.reconstruction.known_rooms import (
     KnownAnswer,
-    known_rooms,
+    KnownRooms,
     mask_overlap,
-    nearest_answers,
-    random_answers,
     turn_scene,
 )
 
 
 @pytest.fixture(scope="module")
 def rooms(toy_shards):
-    return known_rooms(toy_shards)
+    return KnownRooms(toy_shards)
 
 
 def test_every_room_is_there_in_four_turns(rooms):
@@ -44,12 +42,12 @@ def test_every_room_is_there_in_four_turns(rooms):
 def test_the_image_of_a_known_room_finds_it_under_another_name(rooms, toy_shards, renderer):
     images = images_of_split(toy_shards, "train", 0, limit=4)[0]
     strangers = [replace(image, room_id="unknown") for image in images]
-    for image, answer in zip(images, nearest_answers(rooms, strangers, renderer), strict=True):
+    for image, stranger in zip(images, strangers, strict=True):
+        answer = rooms.nearest(stranger, renderer)
         assert answer.scene.name == image.room_id
         assert answer.scene.extra["turned_degrees"] == 0
         assert mask_overlap(answer, image, renderer) > 0.9
-    for image, answer in zip(images, nearest_answers(rooms, images, renderer), strict=True):
-        assert answer.scene.name != image.room_id
+        assert rooms.nearest(image, renderer).scene.name != image.room_id
 
 
 def test_overlap_is_one_for_the_room_itself_and_none_for_nothing(toy_shards, renderer):
@@ -62,24 +60,23 @@ def test_overlap_is_one_for_the_room_itself_and_none_for_nothing(toy_shards, ren
     assert mask_overlap(nothing, image, renderer) == 0
 
 
-def names_of(answers) -> list[tuple[str, int]]:
-    return [(one.scene.name, one.scene.extra["turned_degrees"]) for one in answers]
-
-
 def test_random_rooms_come_from_the_seed_and_are_never_the_images_own(rooms, toy_shards):
     images = images_of_split(toy_shards, "train", 0)[0]
-    drawn = [random_answers(rooms, images, seed) for seed in range(3)]
-    again = random_answers(rooms, images, 0)
-    assert names_of(again) == names_of(drawn[0]) != names_of(drawn[1])
-    for answers in drawn:
+    names = []
+    for seed in (0, 0, 1):
+        rng = np.random.default_rng(seed)
+        answers = [rooms.drawn(image, rng) for image in images]
+        names.append([(one.scene.name, one.scene.extra["turned_degrees"]) for one in answers])
         for image, answer in zip(images, answers, strict=True):
             assert answer.scene.name != image.room_id
             assert len(answer.objects) == len(image.rows)
             assert all(item is None or item.mesh is not None for item in answer.objects)
+    assert names[0] == names[1] != names[2]
 
 
-def test_a_room_that_is_the_only_one_is_no_baseline(rooms, toy_shards):
+def test_a_room_that_is_the_only_one_is_no_baseline(toy_shards):
     image = images_of_split(toy_shards, "train", 0, limit=1)[0][0]
-    only = replace(rooms, scenes=tuple(s for s in rooms.scenes if s.name == image.room_id))
+    only = KnownRooms(toy_shards)
+    only.scenes = [scene for scene in only.scenes if scene.name == image.room_id]
     with refused("lifted/only room"):
-        random_answers(only, [image], 0)
+        only.drawn(image, np.random.default_rng(0))

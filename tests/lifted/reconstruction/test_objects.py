@@ -96,9 +96,9 @@ def test_an_object_of_the_right_size_goes_where_it_stands(place):
 def test_the_box_that_most_agree_with_wins_over_a_slightly_likelier_one():
     centers = torch.tensor([[0.0, 0, 0], [3.0, 0, 0], [3.02, 0, 0], [2.98, 0, 0]])
     placed = Placed(centers, torch.tensor([0.9, 1.0, 1.0, 1.0]))
-    assert likeliest_box(placed, torch.ones(4, 3), torch.arange(4)) == 1
+    assert likeliest_box(placed, torch.ones(4, 3)) == 1
     lone = placed._replace(energy=torch.tensor([0.0, 9.0, 9.0, 9.0]))
-    assert likeliest_box(lone, torch.ones(4, 3), torch.arange(4)) == 0
+    assert likeliest_box(lone, torch.ones(4, 3)) == 0
 
 
 def test_a_run_whose_rooms_are_all_empty_says_so(trained, images, monkeypatch):
