@@ -1,7 +1,6 @@
 """The GAN baseline: the paper's network, trained by a discriminator of semantic maps."""
 
 import copy
-from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -11,7 +10,7 @@ import torch
 from jaxtyping import Float
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from pydantic import Field
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
@@ -216,15 +215,17 @@ class GanStage(lightning.LightningModule):
         rates = self.settings
         shape = list(self.generator.shape.parameters())
         others = [p for name, p in self.generator.named_parameters() if "shape." not in name]
+        networks = (
+            ((others, rates.learning_rate), (shape, SHAPE_RATE * rates.learning_rate)),
+            ((self.discriminator.parameters(), rates.discriminator_learning_rate),),
+        )
         return [
-            _adam((others, rates.learning_rate), (shape, SHAPE_RATE * rates.learning_rate)),
-            _adam((self.discriminator.parameters(), rates.discriminator_learning_rate)),
+            torch.optim.Adam(
+                [{"params": own, "lr": rate, "initial_lr": rate} for own, rate in parts],
+                betas=BETAS,
+            )
+            for parts in networks
         ]
-
-
-def _adam(*parts: tuple[Iterable[nn.Parameter], float]) -> torch.optim.Optimizer:
-    groups = [{"params": own, "lr": rate, "initial_lr": rate} for own, rate in parts]
-    return torch.optim.Adam(groups, betas=BETAS)
 
 
 @torch.no_grad()

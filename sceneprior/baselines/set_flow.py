@@ -83,10 +83,8 @@ class SetFlow(nn.Module):
     def to_tokens(self, rooms: RoomBoxes) -> Float[Tensor, "rooms objects token"]:
         """The tokens of rooms; the values of padding tokens are undefined."""
         one_hot = F.one_hot(rooms.object_class, self.classes)[..., 1:]
-        return torch.cat([self._unit(_numbers(rooms)), self.class_scale * one_hot], dim=-1)
-
-    def _unit(self, numbers: Tensor) -> Tensor:
-        return (numbers - self.mean) / self.spread
+        unit = (_numbers(rooms) - self.mean) / self.spread
+        return torch.cat([unit, self.class_scale * one_hot], dim=-1)
 
     def to_rooms(
         self, tokens: Float[Tensor, "rooms objects token"], is_object: Bool[Tensor, "rooms objects"]

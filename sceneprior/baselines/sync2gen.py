@@ -225,39 +225,6 @@ class Sync2Gen(nn.Module):
         """Decode latents to matrices whose first attribute is the logit of a slot's existence."""
         return self.decoder(z).unflatten(-1, (self.classes - 1, self.slots, ATTRIBUTES))
 
-    def losses(
-        self,
-        matrix: Float[Tensor, "rooms classes slots 7"],
-        decoded: Float[Tensor, "rooms classes slots 7"],
-        mean: Float[Tensor, "rooms latent"],
-        log_variance: Float[Tensor, "rooms latent"],
-    ) -> dict[str, Float[Tensor, " rooms"]]:
-        """Losses of each room: existence over all slots, other attributes over filled slots."""
-        exists = matrix[..., 0]
-        off = F.smooth_l1_loss(decoded[..., 1:], matrix[..., 1:], reduction="none")
-        off = off * exists.unsqueeze(-1)
-        existence = F.binary_cross_entropy_with_logits(decoded[..., 0], exists, reduction="none")
-        return {
-            "existence": existence.sum(dim=(1, 2)),
-            "position": off[..., :3].sum(dim=(1, 2, 3)),
-            "size": off[..., 3:].sum(dim=(1, 2, 3)),
-            "kl": 0.5 * (mean**2 + log_variance.exp() - 1 - log_variance).sum(dim=-1),
-        }
-
-    @torch.no_grad()
-    def note_errors(
-        self,
-        matrix: Float[Tensor, "rooms classes slots 7"],
-        decoded: Float[Tensor, "rooms classes slots 7"],
-    ) -> None:
-        """Update the running errors of decoded centres, which refinement uses."""
-        off_m = (decoded - matrix)[..., [1, 3]] * self.spread_m[..., [0, 2]]
-        squared = (off_m**2).mean(dim=-1) * matrix[..., 0]
-        count = matrix[..., 0].sum(dim=(0, 2))
-        newest = squared.sum(dim=(0, 2)) / count.clamp(min=1)
-        known = self.pairs.error_m2[1:]
-        known += MOMENTUM * (count > 0) * (newest - known)
-
     @torch.no_grad()
     def sample(self, count: int, seed: int) -> RoomBoxes:
         """New rooms, from latents of N(0, 1). The first rooms of a seed do not depend on
@@ -335,9 +302,24 @@ class Sync2genStage(OneStage):
         z = mean + torch.exp(0.5 * log_variance) * torch.randn_like(mean)
         decoded = self.prior.decode(z)
         with full_precision(self.device):
-            decoded = decoded.float()
-            losses = self.prior.losses(matrix, decoded, mean.float(), log_variance.float())
-            self.prior.note_errors(matrix, decoded)
+            decoded, mean, log_variance = decoded.float(), mean.float(), log_variance.float()
+            # Existence is compared in all slots, other attributes in filled slots.
+            exists = matrix[..., 0]
+            off = F.smooth_l1_loss(decoded[..., 1:], matrix[..., 1:], reduction="none")
+            off = off * exists.unsqueeze(-1)
+            entropy = F.binary_cross_entropy_with_logits(decoded[..., 0], exists, reduction="none")
+            losses = {
+                "existence": entropy.sum(dim=(1, 2)),
+                "position": off[..., :3].sum(dim=(1, 2, 3)),
+                "size": off[..., 3:].sum(dim=(1, 2, 3)),
+                "kl": 0.5 * (mean**2 + log_variance.exp() - 1 - log_variance).sum(dim=-1),
+            }
+            # Running errors of decoded centres, which refinement uses.
+            off_m = (decoded.detach() - matrix)[..., [1, 3]] * self.prior.spread_m[..., [0, 2]]
+            count = exists.sum(dim=(0, 2))
+            squared = ((off_m**2).mean(dim=-1) * exists).sum(dim=(0, 2))
+            known = self.prior.pairs.error_m2[1:]
+            known += MOMENTUM * (count > 0) * (squared / count.clamp(min=1) - known)
             objects = rooms.is_object.sum()
-            left_out = (objects - matrix[..., 0].sum()) / objects.clamp(min=1)
+            left_out = (objects - exists.sum()) / objects.clamp(min=1)
             return self.total(room_means(losses, rooms), rooms, left_out=left_out)

@@ -58,10 +58,6 @@ class LiftedStageConfig(LatentStageConfig):
     decoder_learning_rate: float | None = Field(None, gt=0)
     """Learning rate of the shape decoder; None uses `learning_rate`."""
 
-    @property
-    def shape_rate(self) -> float:
-        return self.decoder_learning_rate or self.learning_rate
-
 
 class LiftedSamplingConfig(Section):
     """Sampling of new rooms."""

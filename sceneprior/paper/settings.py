@@ -47,8 +47,8 @@ class LatentStageConfig(TrainConfig):
 
     @property
     def shape_rate(self) -> float:
-        """Learning rate of the shape decoder."""
-        return self.learning_rate
+        """Learning rate of the shape decoder, which a stage may set apart."""
+        return getattr(self, "decoder_learning_rate", None) or self.learning_rate
 
 
 class Steps(Section):
@@ -101,10 +101,6 @@ class ShapeConfig(StageConfig):
     box_from: Literal["mesh", "proxy"] = "mesh"
     """Shape from which 2D boxes are computed in this stage: the deformed `mesh` (paper), or the
     `proxy`, as in the layout stage."""
-
-    @property
-    def shape_rate(self) -> float:
-        return self.decoder_learning_rate or self.learning_rate
 
 
 class SamplingConfig(Section):

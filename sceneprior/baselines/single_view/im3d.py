@@ -38,7 +38,6 @@ from sceneprior.baselines.single_view.detector import (
     DetectorModel,
     DetectorTraining,
     Estimate,
-    TrueObjects,
     TrueViews,
     corner_loss,
     estimate_losses,
@@ -227,19 +226,14 @@ class Im3dStage(OneStage):
                 + smooth_l1(refined.log_sizes, true.boxes.log_sizes)
                 + smooth_l1(refined.log_distances, true.boxes.log_distances)
             )
-            losses["shape"] = occupancy_loss(found, blobs, true, self.settings.points)
+            # The occupancy of random cells of each true box.
+            cells = torch.randint(CELLS**3, (len(found), self.settings.points), device=blobs.device)
+            inside = true.occupied.flatten(1).gather(1, cells).to(blobs)
+            logits = occupancy_logits(blobs, found.to_frame(cell_centers(CELLS).to(blobs)[cells]))
+            each = F.binary_cross_entropy_with_logits(logits, inside, reduction="none")
+            losses["shape"] = mean_of_masks(each)
             losses["overlap"] = overlap_loss(found, refined.in_room(found), blobs.detach())
             return self.total(losses, batch.views)
-
-
-def occupancy_loss(
-    found: Detections, blobs: Float[Tensor, "masks blobs 7"], true: TrueObjects, count: int
-) -> Float[Tensor, ""]:
-    """Binary cross entropy of `count` random cells of each true box."""
-    cells = torch.randint(CELLS**3, (len(found), count), device=blobs.device)
-    inside = true.occupied.flatten(1).gather(1, cells).to(blobs)
-    logits = occupancy_logits(blobs, found.to_frame(cell_centers(CELLS).to(blobs)[cells]))
-    return mean_of_masks(F.binary_cross_entropy_with_logits(logits, inside, reduction="none"))
 
 
 def overlap_loss(

@@ -7,7 +7,7 @@ differences.
 from typing import Literal
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
 
@@ -81,7 +81,8 @@ class Total3d(ViewNetwork):
 
 
 class Total3dStage(OneStage):
-    """Learns the true boxes and surfaces of the masked objects in all sampled views."""
+    """Learns the true boxes and surfaces of the masked objects in all sampled views. Surfaces are
+    compared by the Chamfer distance between vertices and true points."""
 
     prior: Total3d
 
@@ -91,26 +92,16 @@ class Total3dStage(OneStage):
         with full_precision(self.device):
             true = true_objects(found, batch)
             losses = estimate_losses(found, estimate, true)
-            losses |= mesh_losses(vertices, self.prior.shape.faces, true.points)
+            with torch.no_grad():  # the choice of the nearest point has no gradient
+                apart = torch.cdist(vertices, true.points)
+                of_vertices, of_points = (apart.min(dim=dim).indices for dim in (2, 1))
+            there = vertices - torch.take_along_dim(true.points, of_vertices[..., None], dim=1)
+            back = true.points - torch.take_along_dim(vertices, of_points[..., None], dim=1)
+            losses["chamfer"] = mean_squared_length(there) + mean_squared_length(back)
+            faces = self.prior.shape.faces
+            edges = vertices[:, faces] - vertices[:, faces.roll(1, dims=1)]
+            losses["edges"] = mean_squared_length(edges)
             return self.total(losses, batch.views)
-
-
-def mesh_losses(
-    vertices: Float[Tensor, "masks vertices 3"],
-    faces: Int[Tensor, "faces 3"],
-    points: Float[Tensor, "masks points 3"],
-) -> dict[str, Float[Tensor, ""]]:
-    """Chamfer distance between vertices and true points, and mean squared edge length."""
-    with torch.no_grad():  # the choice of the nearest point has no gradient
-        apart = torch.cdist(vertices, points)
-        of_vertices, of_points = (apart.min(dim=dim).indices for dim in (2, 1))
-    there = vertices - torch.take_along_dim(points, of_vertices[..., None], dim=1)
-    back = points - torch.take_along_dim(vertices, of_points[..., None], dim=1)
-    edges = vertices[:, faces] - vertices[:, faces.roll(1, dims=1)]
-    return {
-        "chamfer": mean_squared_length(there) + mean_squared_length(back),
-        "edges": mean_squared_length(edges),
-    }
 
 
 def mean_squared_length(vectors: Float[Tensor, "masks *many 3"]) -> Float[Tensor, ""]:

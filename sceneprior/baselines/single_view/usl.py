@@ -7,7 +7,7 @@ docs/baselines_single_view.md names the differences.
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from pydantic import Field
 from torch import Tensor
 
@@ -103,7 +103,15 @@ class Usl(ViewNetwork):
 
 
 class UslStage(OneStage):
-    """Compares predictions from one view with the masks of the other views."""
+    """Compares predictions from one view with the masks of the other views.
+
+    The losses are means over objects: on 2D boxes, on silhouettes, and, where an object is
+    predicted outside a view that shows it, the frustum loss (`frustum_loss`). Each silhouette is
+    rendered alone. The object may continue behind other objects, so pixels that show another object
+    are left out:
+
+        L_mask = 1 - IoU(silhouette, mask) over the remaining pixels
+    """
 
     prior: Usl
     settings: UslTraining
@@ -113,53 +121,32 @@ class UslStage(OneStage):
         others = some_views(views, slice(1, None))
         placed, vertices_m = self.prior(found)
         with full_precision(self.device):
-            losses = other_view_losses(
-                found, placed, vertices_m, self.prior.shape.faces, others, self.settings
+            shape = others.is_object.shape
+            predicted = found.of_objects(torch.ones_like(found.image, dtype=torch.bool), *shape)
+            vertices_m = found.of_objects(vertices_m.float(), *shape)
+            centers_m = found.of_objects(placed.centers_m.float(), *shape)
+            cameras = (others.world_to_camera, others.intrinsics)
+            boxes, inside = boxes_of_points(vertices_m, *cameras, others.image_size)
+            seen = others.visible & predicted.unsqueeze(1)
+            counted = seen & inside
+            height, width = others.observed_ids.shape[-2:]
+            silhouettes = render_silhouettes(
+                vertices_m,
+                self.prior.shape.faces,
+                others.world_to_camera,
+                others.intrinsics_at(height, width),
+                (height, width),
+                mode=self.settings.silhouettes,
+                compositing="alone",
+                drawn=predicted,
             )
+            slack = self.settings.occlusion_slack
+            losses = {
+                "box": box_loss(boxes, others.boxes, others.sides_clear, counted, slack),
+                "frustum": frustum_loss(centers_m, others, seen & ~inside),
+                "mask": silhouette_loss(silhouettes, others, counted),
+            }
             return self.total(losses, views)
-
-
-def other_view_losses(
-    found: Detections,
-    placed: Placed,
-    vertices_m: Float[Tensor, "masks vertices 3"],
-    faces: Int[Tensor, "faces 3"],
-    others: SceneViews,
-    settings: UslTraining,
-) -> dict[str, Float[Tensor, ""]]:
-    """Losses in the other views, as means over objects: on 2D boxes, on silhouettes, and, where an
-    object is predicted outside a view that shows it, the frustum loss (`frustum_loss`).
-
-    Each silhouette is rendered alone. The object may continue behind other objects, so pixels that
-    show another object are left out:
-
-        L_mask = 1 - IoU(silhouette, mask) over the remaining pixels
-    """
-    rooms, objects = others.is_object.shape
-    predicted = found.of_objects(torch.ones_like(found.image, dtype=torch.bool), rooms, objects)
-    vertices_m = found.of_objects(vertices_m.float(), rooms, objects)
-    centers_m = found.of_objects(placed.centers_m.float(), rooms, objects)
-    cameras = (others.world_to_camera, others.intrinsics)
-    boxes, inside = boxes_of_points(vertices_m, *cameras, others.image_size)
-    seen = others.visible & predicted.unsqueeze(1)
-    counted = seen & inside
-    height, width = others.observed_ids.shape[-2:]
-    silhouettes = render_silhouettes(
-        vertices_m,
-        faces,
-        others.world_to_camera,
-        others.intrinsics_at(height, width),
-        (height, width),
-        mode=settings.silhouettes,
-        compositing="alone",
-        drawn=predicted,
-    )
-    slack = settings.occlusion_slack
-    return {
-        "box": box_loss(boxes, others.boxes, others.sides_clear, counted, slack),
-        "frustum": frustum_loss(centers_m, others, seen & ~inside),
-        "mask": silhouette_loss(silhouettes, others, counted),
-    }
 
 
 def silhouette_loss(
