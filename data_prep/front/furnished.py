@@ -77,13 +77,13 @@ class Room:
 
 
 class ModelBank:
-    """3D-FUTURE's models: all categories, and meshes on demand in a cache of `cache_bytes`."""
+    """3D-FUTURE's models: all categories, and meshes on demand in a cache."""
 
-    def __init__(self, folder: Path, cache_bytes: int = _CACHE_BYTES):
+    def __init__(self, folder: Path):
         self.folder = Path(folder)
         self._categories = model_categories(self.folder)
         self._meshes: LRUCache = LRUCache(
-            cache_bytes, lambda mesh: mesh.vertices_m.nbytes + mesh.faces.nbytes
+            _CACHE_BYTES, lambda mesh: mesh.vertices_m.nbytes + mesh.faces.nbytes
         )
 
     def category(self, model_id: str) -> str:

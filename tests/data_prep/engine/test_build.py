@@ -1,21 +1,15 @@
 """Houses to shards: right boxes, the same bytes whatever the workers, failures for themselves."""
 
-import json
-
 import numpy as np
 import pytest
 from front_files import bedroom, room
 from front_jobs import digests, front_job, rooms_of, three_houses
-from front_reading import shared_front
 from golden_values import hold
 from refusals import refused
 from toy_source import ToySource
 
 from data_prep.engine.build import Job, build_shards, read_finished
-from data_prep.front.recipe import load_recipe
-from data_prep.front.source import FrontSource
 from data_prep.inspection.agreement import true_bodies
-from data_prep.inspection.verify import agreement_of, verify
 from sceneprior.core.classes import label_set
 from sceneprior.core.shards import read_index
 
@@ -50,37 +44,6 @@ def test_a_whole_job(front, tmp_path):
             "height": float(truth.height_m),
         }
     hold("shards", {"rooms": found, "counts": summary.counts, "index": index}, slack=1e-4)
-
-
-def test_boxes_of_free_standing_pieces_are_their_projected_corners(front, tmp_path):
-    """A box is the convex hull of its corners: masks must end within a pixel of the projection."""
-    pieces = [{"jid": "stand", "pos": (0.0, 0.0, 0.0), "yaw": 0.4}]
-    front.house("house", *(room(f"Bedroom-{k}", pieces) for k in range(4)))
-    out = tmp_path / "shards"
-    rules = ("min_objects=1", "required_classes=[]", "views.image_size=[360, 480]")
-    build_shards(front_job(front, out, rules=rules))
-    corners = np.array([[x, y, z, 1] for x in (-0.25, 0.25) for y in (0, 0.6) for z in (-0.2, 0.2)])
-    errors = []
-    for views, truth in rooms_of(out).values():
-        here = (corners @ truth.model_to_room[0].T)[:, :3]
-        np.testing.assert_allclose(
-            here.min(axis=0), truth.centers_m[0] - truth.sizes_m[0] / 2, atol=1e-6
-        )
-        for view in np.flatnonzero(views.visible[:, 0]):
-            turn, K = views.world_to_camera[view], views.intrinsics[view]
-            points = here @ turn[:3, :3].T + turn[:3, 3]
-            pixels = (points @ K.T)[:, :2] / points[:, 2:]
-            expected = np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
-            outside = expected.min() < 0 or (expected > (480, 360, 480, 360)).any()
-            if points[:, 2].min() < 0.05 or outside:
-                continue
-            found = views.boxes[view, 0] * (480, 360, 480, 360)
-            # Pixel centres: never more than half a pixel outside, and only the thin tip of a
-            # corner may fall between centres.
-            off = (found - expected) * (-1, -1, 1, 1)
-            assert off.max() <= 0.501 and off.min() > -2
-            errors += np.abs(off).tolist()
-    assert len(errors) > 40 and np.mean(errors) < 0.3
 
 
 def test_what_void_hides_is_not_seen(front, tmp_path):
@@ -131,21 +94,6 @@ def test_a_room_is_the_same_alone(front, tmp_path):
         np.testing.assert_array_equal(alone.instance_ids, whole.instance_ids)
 
 
-def test_houses_made_by_others(tmp_path):
-    """Stored masks agree with the projected meshes of the furniture."""
-    folder = shared_front()
-    recipe = load_recipe("bedroom", ("views.per_m2=0.5",))
-    source = FrontSource(folder / "3D-FRONT", folder / "3D-FUTURE-model", recipe, only="0022c821")
-    build_shards(Job(source, tmp_path / "a", renderer="software"))
-    ((views, _),) = rooms_of(tmp_path / "a").values()
-    assert views.room_id == "0022c821-c1f2-516e-8552-8f01efccfc26_MasterBedroom-8629"
-    names = [label_set("front3d_bedroom")[c] for c in views.object_class]
-    assert names.count("double_bed") == 1 and "armchair" in names and "void" not in names
-    found = verify(tmp_path / "a")
-    tally = agreement_of(found.every)["mesh"]
-    assert found.problems == () and tally.whole > 3 and tally.mean_iou > 0.95
-
-
 def test_a_source_that_draws_nothing_comes_through_the_same_door(tmp_path):
     one, two = tmp_path / "one", tmp_path / "two"
     summary = build_shards(Job(ToySource(), one))
@@ -182,22 +130,6 @@ def test_a_damaged_report_is_work_to_do(tmp_path):
         assert read_finished(out / "train" / "toys_0000.h5") is None
     assert build_shards(Job(ToySource(), out)).shards_made == 1
     assert digests(out) == expected
-
-
-def test_a_house_that_is_cut_off_meanwhile_costs_its_own_rooms_only(front, tmp_path):
-    front.house("cut", bedroom("Bedroom-1"), bedroom("Bedroom-2"))
-    front.house("good", bedroom("Bedroom-3"), bedroom("Bedroom-4"), bedroom("Bedroom-5"))
-    splits = tmp_path / "splits.csv"
-    splits.write_text("".join(f"Bedroom-{k},{'test' if k == 5 else 'train'}\n" for k in range(6)))
-    job = front_job(front, tmp_path / "shards", splits=splits)
-    build_shards(job)
-    (job.out / "train" / "bedroom_0000.h5").unlink()
-    text = (front.front / "cut.json").read_bytes()
-    (front.front / "cut.json").write_bytes(b"{" * len(text))  # the size is what a folder remembers
-    assert build_shards(job).statuses == {"prepared": 3, "failed": 2}
-    report = json.loads((job.out / "report.json").read_text())
-    assert {item["room_id"] for item in report["failed"]} == {"cut_Bedroom-1", "cut_Bedroom-2"}
-    assert all("cut.json is not JSON" in item["reason"] for item in report["failed"])
 
 
 def test_debugging_lets_the_unforeseen_through(tmp_path, monkeypatch):

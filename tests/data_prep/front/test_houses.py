@@ -250,20 +250,6 @@ def test_a_turned_and_moved_house_has_the_same_room_up_to_quarter_turns(front, a
     assert off == pytest.approx(math.hypot(x, z + 1), abs=1e-5)
 
 
-def test_a_plain_room_by_hand(front):
-    path = front.house("house", bedroom("Bedroom-7", bounds=(1.0, 2.0, 5.0, 8.0), floor_y=0.5))
-    found = only_room(front, path)
-    assert found.floor.bounds == (-2.0, -3.0, 2.0, 3.0) and found.height_m == pytest.approx(2.6)
-    # The floor's centre (3, 0.5, 5) is the origin; the bed stands at (0, 0, -1), below the floor.
-    lower, upper = extent(found.furniture[0])
-    np.testing.assert_allclose(lower, (-3.9, -0.5, -7.0), atol=1e-6)
-    np.testing.assert_allclose(upper, (-2.1, 0.5, -5.0), atol=1e-6)
-    # A nightstand of 0.5 x 0.4, turned by 90 degrees, is 0.4 wide and 0.5 deep, and faces +x.
-    lower, upper = extent(found.furniture[2])
-    np.testing.assert_allclose(upper - lower, (0.4, 0.6, 0.5), atol=1e-6)
-    assert found.furniture[2].yaw_rad == pytest.approx(math.pi / 2)
-
-
 def test_a_crack_is_closed_without_a_spike_at_a_sliver():
     """A sliver's tip was drawn out where cracks are closed, and moved the room's origin."""
 

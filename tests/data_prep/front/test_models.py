@@ -9,8 +9,6 @@ from data_prep.front import furnished
 from data_prep.front.furnished import ModelBank
 from sceneprior.core.furniture import read_obj
 
-BOX_BYTES = 240  # 8 vertices and 12 faces
-
 
 @pytest.fixture
 def reads(monkeypatch):
@@ -23,23 +21,6 @@ def reads(monkeypatch):
 
     monkeypatch.setattr(furnished, "read_obj", noted)
     return seen
-
-
-def test_what_was_used_longest_ago_goes_first(front, reads):
-    for name in ("lamp", "desk"):
-        front.model(name, "Desk", (1.0, 0.7, 0.5))
-    bank = ModelBank(front.future, cache_bytes=2 * BOX_BYTES + 40)
-    for name in ("bed", "lamp", "bed", "desk", "bed", "lamp"):  # the lamp goes for the desk
-        bank.load(name)
-    assert reads == ["bed", "lamp", "desk", "lamp"]
-
-
-def test_what_is_larger_than_the_budget_is_handed_out_and_not_kept(front, reads):
-    bank = ModelBank(front.future, cache_bytes=BOX_BYTES - 1)
-    assert len(bank.load("bed").faces) == len(bank.load("bed").faces) == 12
-    assert reads == ["bed", "bed"]
-    exact = ModelBank(front.future, cache_bytes=BOX_BYTES)
-    assert exact.load("bed") is exact.load("bed") and len(reads) == 3
 
 
 def test_a_model_is_read_again_when_it_failed_or_changed(front, reads):

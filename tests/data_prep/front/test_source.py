@@ -79,22 +79,6 @@ def test_rooms_that_the_recipe_leaves_out_take_no_views_away(front):
     assert views == [16, 24, 32]
 
 
-@pytest.mark.parametrize(
-    ("kind", "csv", "train", "test"),
-    [("bedroom", "bedroom.csv", 152, 38), ("living", "livingroom.csv", 183, 46)],
-)
-def test_no_room_is_lost_that_the_shared_houses_promise(kind, csv, train, test):
-    folder = shared_front()
-    recipe = load_recipe(kind, RULES_OFF)
-    source = FrontSource(
-        folder / "3D-FRONT", folder / "3D-FUTURE-model", recipe, folder / "splits" / csv
-    )
-    with pool(1) as run:
-        found = source.survey(run)
-    splits = [task.split for task in found.rooms]
-    assert (splits.count("train"), splits.count("test"), found.left_out) == (train, test, ())
-
-
 def test_pieces_and_floors_are_what_the_shared_houses_promise():
     folder = shared_front()
     promised = json.loads((folder / "stats.json").read_text())["rooms"]

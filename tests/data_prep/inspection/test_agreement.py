@@ -14,8 +14,6 @@ from data_prep.inspection.agreement import (
     Hull,
     Limits,
     Room,
-    Tally,
-    added,
     boxes_around,
     compare,
     failing,
@@ -64,15 +62,6 @@ def test_a_right_room_agrees_to_the_pixel(made):
     assert failing({"mesh": tally}, Limits()) == [tally]
 
 
-def test_without_meshes_the_boxes_stand_for_them(made):
-    views, truth, shards = made
-    bare = replace(truth, model_ids=("",) * len(truth.model_ids))
-    room, problems = room_of(views, bare, shards)
-    # These pieces are boxes themselves, though some are turned in theirs.
-    tally = compare(room).agreement["box"]
-    assert problems == [] and tally.share == 1.0 and tally.mean_iou > 0.85
-
-
 def test_models_that_are_missing_or_damaged_are_named(made, tmp_path):
     views, truth, _ = made
     shards = shutil.copytree(made[2], tmp_path / "shards")
@@ -85,15 +74,6 @@ def test_models_that_are_missing_or_damaged_are_named(made, tmp_path):
     room, problems = room_of(views, truth, shards)
     assert None in room.bodies and not compare(room).judged[:, room.bodies.index(None)].any()
     assert ".ply is missing, but a room's ground truth refers to it" in problems[0]
-
-
-def test_agreements_add_up():
-    first, second = Tally("box", 4, 3, 2, 1.5), Tally("box", 6, 6)
-    meshes = Tally("mesh", 6, 6)
-    total = added([{"box": first}, {"mesh": meshes, "box": second}])
-    assert total == {"mesh": meshes, "box": Tally("box", 10, 9, 2, 1.5)}
-    assert failing(total, Limits()) == [] and failing({"box": first}, Limits()) == [first]
-    assert failing({"box": first}, Limits(masks=5)) == []
 
 
 def test_a_mirrored_truth_does_not_agree(made):

@@ -7,7 +7,6 @@ from data_prep.tracks.merging import (
     LARGER,
     LEAST,
     MISFIT,
-    MOST,
     OFF,
     Discs,
     balls_of,
@@ -47,16 +46,6 @@ def test_two_views_other_classes_and_larger_clusters_do_not_join():
     np.testing.assert_array_equal(merge_singletons(apart, small, view, np.ones(4, int)), apart)
     gone = discs._replace(radii=discs.radii * [1, 1, 0, 0])
     np.testing.assert_array_equal(merge_singletons(apart, gone, view, np.ones(4, int)), apart)
-
-
-def test_masks_of_wrong_poses_stay_alone():
-    """Every pair is compared with every mask, so their number is limited."""
-    eyes_m = np.random.default_rng(0).uniform(-3, 3, (MOST + 1, 3))
-    discs, view = seen(TWO[:1], 0.2, eyes_m), np.arange(MOST + 1)
-    same = np.ones(MOST + 1, dtype=np.int64)
-    np.testing.assert_array_equal(merge_singletons(view, discs, view, same), view)
-    fewer = Discs(*(each[:MOST] for each in discs))
-    assert not merge_singletons(view[:MOST], fewer, view[:MOST], same[:MOST]).any()
 
 
 def test_misfits_by_hand():
