@@ -30,7 +30,7 @@ from timed_fit import made_shards, paper_run, timed_fit
 from torch import distributed as dist
 
 from sceneprior.training.callbacks import first_process
-from sceneprior.training.checkpoints import read_checkpoint
+from sceneprior.training.method import read_checkpoint
 
 STAGES = ("layout", "shape")
 

@@ -13,8 +13,13 @@ from sceneprior.apps.priors.packed import find_prior, is_packed, read_packed, un
 from sceneprior.core.errors import ConfigError, InputError
 from sceneprior.core.settings import check_settings, read_settings, shortened
 from sceneprior.paper.prior import TrainedPrior
-from sceneprior.training.checkpoints import find_checkpoint
-from sceneprior.training.method import RunConfig, Trained, TrainedReconstructor, without_samples
+from sceneprior.training.method import (
+    RunConfig,
+    Trained,
+    TrainedReconstructor,
+    find_checkpoint,
+    without_samples,
+)
 
 METHODS = {
     "paper": "sceneprior.paper.config:PaperConfig",

@@ -17,9 +17,15 @@ from lightning.pytorch.plugins.environments import SLURMEnvironment
 from lightning.pytorch.utilities import rank_zero_only
 from rich import progress
 from rich.console import Console
+from torch import nn
 
-from sceneprior.training.checkpoints import write_checkpoint
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import write_whole
+from sceneprior.training.method import read_checkpoint
 from sceneprior.training.steps import batch_seed
+
+_RESUMED = ("epoch", "global_step", "loops", "optimizer_states", "pytorch-lightning_version")
+"""Keys of a checkpoint that the trainer needs to resume, in addition to the weights."""
 
 
 class RunProgress(Callback):
@@ -56,8 +62,7 @@ class RunProgress(Callback):
             self._progress.stop()
             self._progress = None
 
-    def on_exception(self, *_: Any) -> None:
-        self.on_train_end()
+    on_exception = on_train_end
 
 
 class StepSeed(Callback):
@@ -86,6 +91,30 @@ class RollingCheckpoint(Callback):
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, pl_module) -> None:
         write_checkpoint(trainer, self.folder, "last.ckpt")
+
+
+def write_checkpoint(trainer: lightning.Trainer, folder: Path, name: str) -> None:
+    """Write a checkpoint atomically; every process calls this, and the first one writes."""
+    if trainer.is_global_zero:
+        write_whole(folder / name, trainer.save_checkpoint)
+    else:
+        trainer.save_checkpoint(folder / name)  # collective: takes part, but writes nothing
+    # Other processes may be about to read it.
+    trainer.strategy.barrier()
+
+
+def check_resumable(path: Path, module: nn.Module) -> None:
+    """Check that a stage can be resumed from a checkpoint."""
+    saved = read_checkpoint(path)
+    missing = [name for name in _RESUMED if name not in saved]
+    shapes = {name: getattr(value, "shape", None) for name, value in saved["state_dict"].items()}
+    expected = {name: value.shape for name, value in module.state_dict().items()}
+    if missing or shapes != expected:
+        reason = f"it has no {missing[0]}" if missing else "its tensors are of another network"
+        raise InputError(
+            f"Training cannot be resumed from {path}: {reason}. Delete it, and the same command "
+            "trains the stage from its start."
+        )
 
 
 def first_process() -> bool:
@@ -119,7 +148,10 @@ def requeue_on_signal() -> Iterator[None]:
         signal.signal(number, signal.SIG_IGN)  # srun may send the signal twice
         if first_process():
             # Requeued first, while there is time: SLURM then sends SIGTERM.
-            subprocess.run(["scontrol", "requeue", _job()], check=False)
+            job = os.environ["SLURM_JOB_ID"]
+            if array := os.environ.get("SLURM_ARRAY_JOB_ID"):
+                job = f"{array}_{os.environ['SLURM_ARRAY_TASK_ID']}"
+            subprocess.run(["scontrol", "requeue", job], check=False)
         raise KeyboardInterrupt
 
     before = signal.signal(signal.SIGUSR1, leave)
@@ -127,10 +159,3 @@ def requeue_on_signal() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGUSR1, before)
-
-
-def _job() -> str:
-    array = os.environ.get("SLURM_ARRAY_JOB_ID")
-    if array is not None:
-        return f"{array}_{os.environ['SLURM_ARRAY_TASK_ID']}"
-    return os.environ["SLURM_JOB_ID"]

@@ -22,12 +22,13 @@ from sceneprior.training.callbacks import (
     RollingCheckpoint,
     RunProgress,
     StepSeed,
+    check_resumable,
     first_process,
     requeue_on_signal,
     slurm_plugins,
+    write_checkpoint,
 )
-from sceneprior.training.checkpoints import check_resumable, read_checkpoint, write_checkpoint
-from sceneprior.training.method import RunConfig, Stage, without_samples
+from sceneprior.training.method import RunConfig, Stage, read_checkpoint, without_samples
 from sceneprior.training.steps import make_loader
 
 LOGGERS = ("csv", "tensorboard", "wandb")
@@ -61,7 +62,7 @@ def fit(
             if final.is_file():
                 read_checkpoint(final)  # raises an error if it is damaged
             else:
-                options = trainer_options or {}
+                options = dict(trainer_options or {})
                 _train(stage, config, final.parent, previous, resume, loggers, options)
             previous = final
 
@@ -125,18 +126,43 @@ def _train(
     module = stage.build(rooms, previous)
     latents = getattr(module, "latents", None)
     pairs_no_room = latents is not None and not len(latents.weight)  # the table is empty
-    room_ids = () if pairs_no_room else rooms.room_ids
-    callbacks: list[lightning.Callback] = [
-        RunProgress(f"fit {stage.name} (epochs)"), StepSeed(config.seed)
+    room_ids = [] if pairs_no_room else [*rooms.room_ids]
+    said = {"sceneprior": {"room_ids": room_ids, "label_set": config.label_set}}
+    callbacks = [
+        RunProgress(f"fit {stage.name} (epochs)"), StepSeed(config.seed),
+        RollingCheckpoint(folder, said), *options.pop("callbacks", ()),
     ]  # fmt: skip
-    said = {"room_ids": list(room_ids), "label_set": config.label_set}
-    callbacks.append(RollingCheckpoint(folder, {"sceneprior": said}))
-    callbacks += options.get("callbacks", ())
-    _quiet_lightning()
+    # Lightning's hints are silenced; GPUs that can multiply matrices fast (TF32) may do so.
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    logging.getLogger("lightning.fabric").setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", module="lightning")
+    torch.set_float32_matmul_precision("high")
     lightning.seed_everything(config.seed, verbose=False)
     if settings.cpu_threads is not None:
         torch.set_num_threads(settings.cpu_threads)
-    trainer = _trainer(stage, folder, loggers, options, callbacks)
+    updates: dict[str, Any] = {
+        "gradient_clip_val": settings.clip_gradient or None,
+        "accumulate_grad_batches": settings.accumulate,
+    }
+    try:
+        trainer = lightning.Trainer(
+            max_epochs=settings.epochs,
+            logger=[make_logger(name, folder) for name in loggers],
+            callbacks=callbacks,
+            plugins=slurm_plugins(),
+            default_root_dir=folder,
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            use_distributed_sampler=False,
+            log_every_n_steps=1,
+            **({} if stage.steps_itself else updates),
+            **options,
+        )
+    except (ValueError, TypeError, RuntimeError) as error:
+        given = ", ".join(f"--{name} {value}" for name, value in options.items())
+        reason = " ".join(str(error).split())
+        raise InputError(f"Lightning cannot train with {given}: {reason}") from None
     if stage.steps_itself and trainer.world_size > 1:
         raise InputError(
             f"method: {config.method} trains in one process, but {trainer.world_size} were "
@@ -169,68 +195,23 @@ def _train(
     write_checkpoint(trainer, folder, "final.ckpt")
 
 
-def _trainer(
-    stage: Stage,
-    folder: Path,
-    loggers: tuple[str, ...],
-    options: dict[str, Any],
-    callbacks: list[lightning.Callback],
-) -> lightning.Trainer:
-    updates: dict[str, Any] = {
-        "gradient_clip_val": stage.settings.clip_gradient or None,
-        "accumulate_grad_batches": stage.settings.accumulate,
-    }
-    options = {name: value for name, value in options.items() if name != "callbacks"}
-    try:
-        return lightning.Trainer(
-            max_epochs=stage.settings.epochs,
-            logger=[make_logger(name, folder) for name in loggers],
-            callbacks=callbacks,
-            plugins=slurm_plugins(),
-            default_root_dir=folder,
-            enable_checkpointing=False,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-            use_distributed_sampler=False,
-            log_every_n_steps=1,
-            **({} if stage.steps_itself else updates),
-            **options,
-        )
-    except (ValueError, TypeError, RuntimeError) as error:
-        given = ", ".join(f"--{name} {value}" for name, value in options.items())
-        reason = " ".join(str(error).split())
-        raise InputError(f"Lightning cannot train with {given}: {reason}") from None
-
-
 def make_logger(name: str, folder: Path) -> Logger:
     """Make a logger for a stage's folder; `name` is one of `LOGGERS`.
 
     The CSV logger appends to the file of an interrupted run.
     """
-    if name == "csv":
-        return _csv_logger(folder)
     if name == "tensorboard":
         return TensorBoardLogger(folder, name="", version="")
+    if name == "csv":
+        # Lightning's CSVLogger deletes an existing file, so it is given the rows of earlier epochs.
+        path = folder / "metrics.csv"
+        before = list(csv.DictReader(path.read_text().splitlines())) if path.is_file() else []
+        logger = CSVLogger(folder, name="", version="")
+        if before and first_process():
+            logger.experiment.metrics.extend(before)
+            logger.save()
+        return logger
     from lightning.pytorch.loggers import WandbLogger
 
     key = os.environ.get("WANDB_API_KEY") or Path("~/.netrc").expanduser().is_file()
     return WandbLogger(project="sceneprior", save_dir=folder, name=folder.name, offline=not key)
-
-
-def _csv_logger(folder: Path) -> CSVLogger:
-    # Lightning's CSVLogger deletes an existing file, so it is given the rows of earlier epochs.
-    path = folder / "metrics.csv"
-    before = list(csv.DictReader(path.read_text().splitlines())) if path.is_file() else []
-    logger = CSVLogger(folder, name="", version="")
-    if before and first_process():
-        logger.experiment.metrics.extend(before)
-        logger.save()
-    return logger
-
-
-def _quiet_lightning() -> None:
-    """Silence Lightning's hints, and allow fast (TF32) matrix products on GPUs that have them."""
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
-    logging.getLogger("lightning.fabric").setLevel(logging.WARNING)
-    warnings.filterwarnings("ignore", module="lightning")
-    torch.set_float32_matmul_precision("high")

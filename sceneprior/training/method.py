@@ -1,19 +1,24 @@
-"""The interface of a method (`RunConfig`), and of its trained networks (`Trained`).
+"""The interface of a method (`RunConfig`), its trained networks (`Trained`), and a run's folder.
 
 A method's config adds its own sections to `RunConfig` and implements `stages` (the LightningModules
 that `fit` trains), `networks` (the modules that a checkpoint's weights are loaded into) and
 `trained` (a stage's networks, ready for use). The paper's method is in `paper/config.py`, the
 baselines have their own; `apps/config.py` lists all.
+
+RUN/config.yaml            all settings, defaults included
+RUN/<stage>/last.ckpt      the stage's newest checkpoint, from which `--resume` continues
+RUN/<stage>/final.ckpt     the finished stage, which commands load
+RUN/<stage>/metrics.csv    one line per epoch; TensorBoard's files are in the same folder
 """
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
+import torch
 from pydantic import Field, model_validator
 from torch import nn
 
@@ -24,7 +29,6 @@ from sceneprior.core.scene import Mesh
 from sceneprior.core.settings import Section, shortened
 from sceneprior.core.shards import Shard, list_shards
 from sceneprior.core.views import RoomBoxes, SceneViews
-from sceneprior.training.checkpoints import read_networks
 
 if TYPE_CHECKING:
     import lightning
@@ -167,7 +171,21 @@ class RunConfig(Section, ABC):
 
     def load(self, stage: str, path: Path) -> "Trained":
         """The networks in a stage's checkpoint, in evaluation mode."""
-        networks, room_ids = read_networks(path, partial(self.networks, stage))
+        saved = read_checkpoint(path)
+        try:
+            room_ids = tuple(saved["sceneprior"]["room_ids"])
+            networks = self.networks(stage, len(room_ids))
+            # Weights used only in training, such as a discriminator's, are left out.
+            weights = {k: v for k, v in saved["state_dict"].items() if k.split(".")[0] in networks}
+            networks.load_state_dict(weights)
+        except InputError:
+            raise
+        except Exception as error:  # the error depends on where the wrong part is first used
+            reason = " ".join(str(error).split())[:200]
+            raise InputError(
+                f"{path} does not fit the run's config.yaml ({reason}); use the config it was "
+                "trained with."
+            ) from None
         return self.trained(networks, stage, room_ids)
 
     def check_rooms(self, rooms: Any, max_objects: int | None) -> None:
@@ -282,3 +300,36 @@ class TrainedReconstructor:
 def ready_copy(network: Any) -> Any:
     """A copy of a network on the CPU, in evaluation mode and without gradients."""
     return copy.deepcopy(network).cpu().eval().requires_grad_(False)
+
+
+def find_checkpoint(run: Path, stages: Sequence[str]) -> tuple[str, Path]:
+    """Stage and path of the checkpoint that commands load; `stages` are the run's, in order.
+
+    The last finished stage is chosen; if no stage is finished, the newest checkpoint of the last
+    stage begun.
+    """
+    for name in ("final.ckpt", "last.ckpt"):
+        for stage in reversed(stages):
+            if (run / stage / name).is_file():
+                return stage, run / stage / name
+    raise InputError(
+        f"{run} holds no checkpoint yet; continue its training with `sceneprior fit --config "
+        f"{run / 'config.yaml'} --run {run} --resume`."
+    )
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """The contents of a checkpoint: tensors and plain data only."""
+    try:
+        saved = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:
+        raise InputError(
+            f"{path} cannot be read ({type(error).__name__}); it is damaged. Delete it and run "
+            "`sceneprior fit` with `--resume`."
+        ) from None
+    if not isinstance(saved, dict) or not isinstance(saved.get("state_dict"), dict):
+        raise InputError(
+            f"{path} is not a checkpoint of `sceneprior fit` (it has no state_dict). Delete it and "
+            "run `sceneprior fit` with `--resume`."
+        )
+    return saved

@@ -12,8 +12,8 @@ from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.files import write_json
 from sceneprior.evaluation.metrics.contents import without_void
 from sceneprior.evaluation.synthesis import EvalOptions
-from sceneprior.training.checkpoints import read_checkpoint
 from sceneprior.training.fit import fit
+from sceneprior.training.method import read_checkpoint
 
 METHODS = ("atiss2d", "gan", "atiss", "sync2gen", "set_flow", "usl", "total3d", "im3d")
 STAGES = {name: (name,) for name in METHODS} | {"atiss2d": ("layout", "shape")}

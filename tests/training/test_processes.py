@@ -12,7 +12,7 @@ from tiny_runs import tiny_config, write_tiny_config
 from torch.testing import assert_close
 from toy_rooms import write_toy_shards
 
-from sceneprior.training.checkpoints import read_checkpoint
+from sceneprior.training.method import read_checkpoint
 
 pytestmark = pytest.mark.slow
 

@@ -10,8 +10,8 @@ from tiny_runs import tiny_config
 
 from sceneprior.training import fit as train
 from sceneprior.training.callbacks import StepSeed
-from sceneprior.training.checkpoints import read_checkpoint
 from sceneprior.training.fit import fit
+from sceneprior.training.method import read_checkpoint
 
 pytestmark = pytest.mark.slow
 

@@ -17,8 +17,8 @@ from sceneprior.apps.experiments.report import (
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.lifted.lifting import dataset as lifted
 from sceneprior.paper.sampling import DISTRIBUTIONS, decode_training_rooms
-from sceneprior.training.checkpoints import read_checkpoint
 from sceneprior.training.fit import fit
+from sceneprior.training.method import read_checkpoint
 
 RELEASED = {
     "model__decoder__hidden": 16,

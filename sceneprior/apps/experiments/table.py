@@ -24,7 +24,7 @@ from sceneprior.evaluation.metric import ARROWS, TableColumn
 from sceneprior.evaluation.metrics import DECODED, METRICS
 from sceneprior.lifted.config import SAMPLER
 from sceneprior.paper.sampling import marked
-from sceneprior.training.checkpoints import read_checkpoint
+from sceneprior.training.method import read_checkpoint
 
 Scores = dict[str, Any]
 """Values by key of a result, with its protocol, reference rows and the costs of training."""
