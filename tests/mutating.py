@@ -6,6 +6,7 @@ import resource
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -94,7 +95,7 @@ def damaged_json(data: Any, rng: np.random.Generator) -> str:
         elif action < 0.25 and isinstance(container, list):
             container += [container[key]] * int(rng.choice([1, 3]))
         else:
-            container[key] = JUNK[rng.integers(len(JUNK))]
+            container[key] = deepcopy(JUNK[rng.integers(len(JUNK))])
     if rng.random() < 0.05:
         data = JUNK[rng.integers(len(JUNK))]
     text = json.dumps(data).replace(json.dumps(DEEP), "[" * 3000 + "]" * 3000)

@@ -12,9 +12,12 @@ from types import FrameType
 from typing import Any
 
 import pytest
+from scan_files import make_scan, write_table
 from tiny_runs import tiny_config
 
 import sceneprior
+from data_prep.engine.build import Job, build_shards
+from data_prep.readers.scannet import ScanNet
 from sceneprior.training.steps import make_loader
 
 ROOT = Path(__file__).parents[1]
@@ -70,6 +73,14 @@ def test_a_drawn_room_to_its_glb(prior, tmp_path):
 
 def test_a_wish_to_an_answer(prior):
     assert_short(files_of(lambda: prior.sample(1, want="two nightstands")), 26)
+
+
+def test_a_recording_to_a_shard(tmp_path):
+    """One scan of ScanNet, as `prep-scannet` prepares it."""
+    make_scan(tmp_path / "scans" / "scene0000_00").write(mask_size=(242, 324))
+    labels = write_table(tmp_path / "labels.tsv")
+    source = ScanNet(tmp_path / "scans", labels=labels, frame_step=1)
+    assert_short(files_of(lambda: build_shards(Job(source, tmp_path / "shards"))), 20)
 
 
 def assert_short(files: list[str], most: int) -> None:

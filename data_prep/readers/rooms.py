@@ -19,7 +19,6 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.id_tables import IdTable, tidy
 from sceneprior.core.observations import Observations, RoomGroundTruth, observe, thinned_stuff
 from sceneprior.core.scene import Mesh
-from sceneprior.core.shell import rectangle
 from sceneprior.render.offscreen.zbuffer import NEAR_PLANE_M, rasterize
 
 _BEHIND_M = 0.05
@@ -233,7 +232,8 @@ def _floor(
     outline = room.floor_m
     if outline is None:
         ends = (boxes.reshape(-1, 3) if len(boxes) else eyes)[:, ::2]
-        outline = rectangle(ends.min(axis=0), ends.max(axis=0))
+        low, high = ends.min(axis=0), ends.max(axis=0)
+        outline = np.array([low, (high[0], low[1]), high, (low[0], high[1])])
     center = room.center_m
     if center is None:
         center = (outline.min(axis=0) + outline.max(axis=0)) / 2

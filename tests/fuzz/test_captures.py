@@ -8,7 +8,6 @@ import contextlib
 import json
 import resource
 import signal
-import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -17,7 +16,7 @@ import psutil
 import pytest
 from capture_files import timestamp
 from front_files import FrontFolder, bedroom
-from mutating import MUTATIONS, damaged_json
+from mutating import MUTATIONS, damaged_bytes, damaged_json
 from pycocotools.mask import encode
 from toy_formats import FORMATS
 
@@ -58,15 +57,13 @@ def damaged_text(text: str, rng: np.random.Generator) -> str:
     return "\n".join(lines)
 
 
-def damaged_bytes(data: bytes, rng: np.random.Generator, first: int) -> bytes:
-    """Up to four numbers among the first bytes are others, or the end is gone."""
-    changed = bytearray(data)
-    for _ in range(rng.integers(1, 5)):
-        at = int(rng.integers(first - 8))
-        value = [b"\xff", b"\0\0\0\0", b"\xff" * 8, struct.pack("<f", np.nan), rng.bytes(4),
-                 struct.pack("<f", 1e30), struct.pack("<Q", 1 << 40)][rng.integers(7)]  # fmt: skip
-        changed[at : at + len(value)] = value
-    return bytes(changed[: rng.integers(len(changed))] if rng.random() < 0.2 else changed)
+def damaged(path: Path, whole: bytes, rng: np.random.Generator) -> bytes:
+    """The contents of a file, damaged as its type suggests."""
+    if path.suffix in (".json", ""):
+        return damaged_json(json.loads(whole), rng).encode()
+    if path.suffix in (".txt", ".csv"):
+        return damaged_text(whole.decode(), rng).encode()
+    return damaged_bytes(whole, rng)
 
 
 @contextlib.contextmanager
@@ -88,7 +85,7 @@ def limits() -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
 
-def check_all(damage: Callable[[np.random.Generator], None], read: Callable[[], object]) -> None:
+def check_all(damage: Callable[[np.random.Generator], object], read: Callable[[], object]) -> None:
     """Damage and read `MUTATIONS` times; an error is the package's own, in one sentence or two."""
     refused = 0
     for case in range(MUTATIONS):
@@ -107,88 +104,57 @@ def check_all(damage: Callable[[np.random.Generator], None], read: Callable[[], 
     assert 0.1 * MUTATIONS < refused < MUTATIONS
 
 
-JSONS = {
-    "transforms": "attic/transforms.json",
-    "opencv": "attic/transforms.json",
-    "transforms, small": "attic/classes.json",
-    "polycam": f"attic/keyframes/corrected_cameras/{timestamp(1)}.json",
-    "record3d": "attic/metadata",
-    "grounded-sam2": "attic/json_data/mask_frame_00001.json",
-    "grounded-sam2, images": "attic/json_data/results_1.json",
-    "coco": "attic/coco.json",
-    "coco, tracks": "attic/coco.json",
-    "coco, video": "attic/instances.json",
-    "panoptic": "attic/panoptic.json",
-    "scannet": "scans/scene0000_00/scene0000_00.aggregation.json",
-    "scannet, small": "scans/scene0000_00/scene0000_00_vh_clean_2.0.010000.segs.json",
-}
 SCAN = "scans/scene0000_00/scene0000_00"
-BYTES = {
-    "transforms": [("attic/instances/frame_00001.png", 1000)],
-    "sam2": [("attic/003/frame_00001.png", 200), ("attic/007/frame_00001.png", 30)],
-    "grounded-sam2": [("attic/mask_data/mask_frame_00001.npy", 200)],
-    "colmap": [("attic/sparse/0/images.bin", 1000)],
-    "scannet": [(f"{SCAN}.sens", 450)],
-    "scannet, small": [(f"{SCAN}_2d-instance-filt.zip", 10_000), (f"{SCAN}_vh_clean_2.ply", 1000)],
-}
-"""Files of a format, of which one is damaged, and how many of their first bytes may be."""
-TEXTS = {
-    "colmap, text": "attic/sparse/0/images.txt",
-    "colmap, cameras": "attic/sparse/0/cameras.txt",
-    "scannet": "scans/scene0000_00/scene0000_00.txt",
-}
-SAME = {"scannet, small": "scannet", "colmap, cameras": "colmap, text"}
+SCENE, VIEWS = "ai_001_002", "scene_00007/2D_rendering/480/perspective/full"
+FILES = {
+    "transforms": ["transforms.json", "classes.json", "instances/frame_00001.png"],
+    "opencv": ["transforms.json"],
+    "colmap": ["sparse/0/images.bin", "sparse/0/cameras.bin"],
+    "colmap, text": ["sparse/0/images.txt", "sparse/0/cameras.txt"],
+    "polycam": [f"keyframes/corrected_cameras/{timestamp(1)}.json"],
+    "record3d": ["metadata"],
+    "sam2": ["003/frame_00001.png"],
+    "grounded-sam2": ["json_data/mask_frame_00001.json", "mask_data/mask_frame_00001.npy"],
+    "grounded-sam2, images": ["json_data/results_1.json"],
+    "coco": ["coco.json"],
+    "coco, tracks": ["coco.json"],
+    "coco, video": ["instances.json"],
+    "panoptic": ["panoptic.json"],
+    "scannet": [f"{SCAN}{ending}" for ending in (
+        ".sens", ".txt", ".aggregation.json", "_vh_clean_2.0.010000.segs.json",
+        "_2d-instance-filt.zip", "_vh_clean_2.ply",
+    )],
+    "blenderproc": ["model_info.json", "house/1.hdf5"],
+    "hypersim": ["metadata_camera_parameters.csv", f"{SCENE}/_detail/metadata_scene.csv",
+                 f"{SCENE}/_detail/cam_00/camera_keyframe_positions.hdf5"],
+    "structured3d": ["scene_00007/annotation_3d.json", "scene_00007/bbox_3d.json",
+                     f"{VIEWS}/0/camera_pose.txt", f"{VIEWS}/1/semantic.png"],
+    "scannetpp": ["0a5c01/dslr/nerfstudio/transforms.json", "0a5c01/scans/segments_anno.json"],
+    "scannetpp, iphone": ["0a5c01/iphone/pose_intrinsic_imu.json"],
+}  # fmt: skip
+"""Files of each format that are damaged; those of posed rooms are in `attic`."""
 
 
-@pytest.fixture
-def reading(tmp_path):
-    """Writes a format's toy room, and returns how it is read."""
+@pytest.mark.parametrize(
+    ("name", "file"), [(k, file) for k, files in FILES.items() for file in files]
+)
+def test_damaged_files_of_each_format(tmp_path, name, file):
+    source = FORMATS[name](tmp_path).source
+    path = tmp_path / ("attic" if isinstance(source, Posed) else "") / file
+    whole = path.read_bytes()
+    with pool(1) as run:
+        (task,) = source.survey(run).rooms
 
-    def written(name: str) -> Callable[[], None]:
-        source = FORMATS[SAME.get(name, name)](tmp_path).source
-        with pool(1) as run:
-            (task,) = source.survey(run).rooms
+    def read() -> None:
+        if isinstance(source, Posed):
+            source.found()
+            source.assumptions()
+        source.settings(None)
+        source.rooms(task.house)
+        source.prepare(task, None)
 
-        def read() -> None:
-            if isinstance(source, Posed):
-                source.found()
-                source.assumptions()
-            source.settings(None)
-            source.rooms(task.house)
-            source.prepare(task, None)
-
-        read()
-        return read
-
-    return written
-
-
-@pytest.mark.parametrize("name", JSONS)
-def test_json_of_each_format(reading, tmp_path, name):
-    read, path = reading(name), tmp_path / JSONS[name]
-    data = json.loads(path.read_text())
-    check_all(lambda rng: path.write_text(damaged_json(data, rng)), read)
-
-
-@pytest.mark.parametrize("name", BYTES)
-def test_binary_files_of_each_format(reading, tmp_path, name):
-    read = reading(name)
-    files = [(tmp_path / inside, (tmp_path / inside).read_bytes(), n) for inside, n in BYTES[name]]
-
-    def damage(rng: np.random.Generator) -> None:
-        chosen = rng.integers(len(files))
-        for k, (path, data, first) in enumerate(files):
-            first = min(first, len(data))
-            path.write_bytes(damaged_bytes(data, rng, first) if k == chosen else data)
-
-    check_all(damage, read)
-
-
-@pytest.mark.parametrize("name", TEXTS)
-def test_texts_of_each_format(reading, tmp_path, name):
-    read, path = reading(name), tmp_path / TEXTS[name]
-    text = path.read_text()
-    check_all(lambda rng: path.write_text(damaged_text(text, rng)), read)
+    read()
+    check_all(lambda rng: path.write_bytes(damaged(path, whole, rng)), read)
 
 
 def test_coco_json(tmp_path):

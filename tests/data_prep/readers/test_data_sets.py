@@ -1,7 +1,6 @@
 """Public data sets, from files to shards: classes, masks, cameras, boxes, splits, commands."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -20,14 +19,11 @@ from public_files import (
 from refusals import refused
 from scan_files import write_table
 
-from data_prep.engine.source import RoomTask, pool
+from data_prep.engine.source import pool
 from data_prep.readers import open_reader
 from data_prep.readers.annotations import NYU40, SHELL, ids_and_classes
-from data_prep.readers.frames import GL_TO_CV, Y_UP
-from data_prep.readers.heading import turn_matrix
 from data_prep.readers.hypersim import pinhole, straight_grid
-from data_prep.readers.rooms import FramedRoom, numbered, prepare_room
-from sceneprior.core.boxes import quarter_rotation
+from data_prep.readers.rooms import numbered
 from sceneprior.core.classes import STUFF, label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.ground_truth import reference_scenes
@@ -99,46 +95,6 @@ def test_the_commands_of_public_data_md_write_shards_that_verify(room, tmp_path,
             assert [item.label for item in scene.objects] == ["bed", "chair"]
 
 
-@pytest.mark.parametrize("degrees", [30.0, -75.0])
-def test_rooms_at_an_angle_are_turned_with_their_boxes_and_floors(room, degrees):
-    """The world of a room is turned about y: ground truth and cameras are those of the plain room,
-    up to quarter turns."""
-    room.size, room.focal_px = (192, 256), 160.0
-    for eye in [(-2.5, 0.1, 1.5), (2.5, 0.3, 1.6), (0.1, 2.6, 1.4), (1.6, -2.4, 1.7)]:
-        room.look(eye, (0.1, 0.1, 0.3))
-    ids = np.stack([room.ids(k) for k in range(9)]).astype(np.int32)
-    classes = {3: "bed", 300: "chair", 7: "pillow", 11: "floor", 12: "wall"}
-    boxes = {thing.id: thing.corners @ Y_UP[:3, :3].T for thing in room.things[:3]}
-    plain = FramedRoom(
-        **numbered(ids, classes, "scannet", "a", boxes),
-        camera_to_world=Y_UP @ np.stack(room.poses) @ GL_TO_CV,
-        intrinsics=np.array([[160.0, 0, 128], [0, 160, 96], [0, 0, 1]]),
-        floor_m=np.array([(-3.0, -3), (3, -3), (3, 3.1), (-3, 3.1)]),
-    )
-    turn = turn_matrix(degrees)
-    turned = replace(
-        plain,
-        camera_to_world=turn @ plain.camera_to_world,
-        boxes={k: points @ turn[:3, :3].T for k, points in plain.boxes.items()},
-        floor_m=plain.floor_m @ turn[::2, ::2][:2, :2].T,
-    )
-    one, other = (prepare_room(RoomTask("a", "a", "train"), framed) for framed in (plain, turned))
-    assert one.views.turned_deg == 0 and one.views.room_from_world is None
-    views, truth = other.views, other.truth
-    assert abs((views.turned_deg + degrees + 45) % 90 - 45) < 0.5
-    assert f"turned by {views.turned_deg:.2f} degrees, along its walls" in other.notes[-1]
-    quarter = quarter_rotation(round((views.turned_deg + degrees) / 90))
-    slack = 0.05  # 0.5 degrees at 4 m
-    np.testing.assert_allclose(truth.centers_m, one.truth.centers_m @ quarter.T, atol=slack)
-    np.testing.assert_allclose(truth.sizes_m, one.truth.sizes_m @ abs(quarter).T, atol=slack)
-    level = quarter[::2, ::2]
-    np.testing.assert_allclose(truth.floor_m, one.truth.floor_m @ level.T, atol=slack)
-    mapped = views.room_from_world @ turned.camera_to_world
-    np.testing.assert_allclose(
-        mapped, np.linalg.inv(views.world_to_camera.astype(float)), atol=1e-5
-    )
-
-
 # -- What single data sets have --------------------------------------------------------------------
 
 
@@ -163,19 +119,6 @@ def test_rooms_of_other_types_are_left_out(room, tmp_path):
         prepared("blenderproc", tmp_path, recipe="library")
 
 
-def test_a_truncated_frame_fails_its_house_by_name(room, tmp_path, cli):
-    for house in ("house", "other"):
-        write_blenderproc(tmp_path / "renders", house, room)
-    path = tmp_path / "renders/house/1.hdf5"
-    path.write_bytes(path.read_bytes()[:900])
-    out = tmp_path / "shards"
-    made = cli("prep-dataset", "blenderproc", tmp_path / "renders", "--out", out, "--workers", 1)
-    report = json.loads((out / "report.json").read_text())
-    assert report["statuses"]["prepared"] == 1 and made.exit_code == 3
-    (failed,) = report["failed"]
-    assert failed["room_id"] == "house" and "1.hdf5 cannot be read" in failed["reason"]
-
-
 def test_objects_without_a_box_leave_a_room_without_ground_truth(room, tmp_path):
     write_hypersim(tmp_path, "ai_001_001", room, cam_from_uv(room))
     path = next((tmp_path / "ai_001_001/_detail/mesh").glob("*positions*"))
@@ -183,13 +126,6 @@ def test_objects_without_a_box_leave_a_room_without_ground_truth(room, tmp_path)
         file["dataset"][300] = np.nan
     (made,) = prepared("hypersim", tmp_path).values()
     assert made.truth is None and made.notes[-1] == "1 of 2 objects have no 3D box: no ground truth"
-
-
-def test_a_room_of_walls_alone_shows_no_object(room, tmp_path):
-    room.things = room.things[2:]
-    write_hypersim(tmp_path, "ai_001_001", room, cam_from_uv(room))
-    (line,) = prepared("hypersim", tmp_path).values()
-    assert line.rule == "no_view" and line.reason == "none of its 4 views shows any object"
 
 
 def test_an_unknown_label_set_is_no_room_without_objects():

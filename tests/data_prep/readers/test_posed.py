@@ -16,7 +16,6 @@ from data_prep.inspection.verify import array_problems, mask_problems
 from data_prep.readers.posed.reader import Posed, find_rooms
 from data_prep.readers.posed.recording import frame_intrinsics, room_name, seems_up
 from data_prep.readers.posed.transforms import read_recording
-from sceneprior.core.boxes import yaw_rotation
 from sceneprior.core.classes import label_set
 from sceneprior.core.dataset import ViewDataset
 from sceneprior.core.errors import InputError
@@ -78,31 +77,12 @@ def test_pieces_on_the_floor_find_it_whatever_hangs_or_lies_on_them(room, lift):
     assert "assumed" in prepared(room.write(), classes).notes[-1]
 
 
-def test_the_file_says_units_and_its_world_is_mapped_exactly(room):
-    """Units stated in a file win; axes are exchanged without an error of last bits."""
+def test_units_stated_in_a_file_win(room):
     one, other = (
-        prepared(room.write(**KEYS, metres_per_unit=1.0), metres_per_unit=unit)
+        prepared(room.write(**KEYS, metres_per_unit=1.0), metres_per_unit=unit).views
         for unit in (1.0, 9.0)
     )
-    np.testing.assert_array_equal(one.views.world_to_camera, other.views.world_to_camera)
-    assert one.views.turned_deg == 0 and one.views.room_from_world is None
-    assert np.isin(np.array(one.cameras["room_from_world"])[:3, :3], (0, 1, -1)).all()
-    for eye in [(-2.5, 0.1, 1.5), (2.5, 0.3, 1.6), (0.1, 2.6, 1.4), (1.6, -2.4, 1.7)]:
-        room.look(eye, (0.1, 0.1, 0.3))
-    room.size, room.focal_px = (192, 256), 160.0
-    room.write()
-    turn = np.eye(4)
-    turn[:2, :2] = yaw_rotation(np.radians(33))[::2, ::2]
-    room.poses = [turn @ pose for pose in room.poses]
-    room.write_transforms(room.data | {"floor_m": 0.0})  # the masks are those of before
-    made = prepared(room)
-    views = made.views
-    assert f"turned by {views.turned_deg:.2f} degrees, along its walls" in " ".join(made.notes)
-    np.testing.assert_allclose(views.room_from_world, made.cameras["room_from_world"], atol=1e-8)
-    # The file's poses, mapped by the shard's matrix, are the room's cameras.
-    mapped = views.room_from_world @ np.array(room.poses) @ np.diag([1.0, -1, -1, 1])
-    here = np.linalg.inv(views.world_to_camera.astype(float))
-    np.testing.assert_allclose(mapped, here, atol=1e-5)
+    np.testing.assert_array_equal(one.world_to_camera, other.world_to_camera)
 
 
 def test_a_focal_length_may_be_an_angle_and_a_frames_own(room):
@@ -259,18 +239,6 @@ def test_one_room_is_a_folder_of_rooms(source, rooms, tmp_path, monkeypatch):
     assert find_rooms(source.folder) == [room.folder for room in rooms]
     one = Posed(source.folder, classes=SET, only="room_3")
     assert [room.room_id for room in survey(one).rooms] == ["room_3"]
-
-
-def test_rooms_of_another_size_are_left_out_with_the_reason(source, rooms):
-    PosedRoom(rooms[2].folder, size=(128, 96)).write()
-    found = survey(source)
-    assert [room.room_id for room in found.rooms] == ["room_0", "room_1", "room_3"]
-    (left,) = found.left_out
-    assert (left.room_id, left.status, left.rule) == ("room_2", "filtered", "image_size")
-    (alone,) = survey(Posed(rooms[2].folder, classes=SET)).rooms
-    assert alone.room_id == "room_2"
-    with pytest.raises(InputError, match=r"for --only room_2 .1 were left out; the most frequent"):
-        survey(Posed(source.folder, classes=SET, only="room_2"))
 
 
 def test_settings_follow_the_files(source, rooms):
