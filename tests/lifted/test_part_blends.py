@@ -5,8 +5,8 @@ import pytest
 import trimesh
 from parts_of_rooms import CORNER, TABLE
 
-from sceneprior.core.parts import CYLINDER, DOME, SQUARE, Parts, filled_cells, surface_of_parts
-from sceneprior.lifted.shape_morphing import blend_parts, matched_outlines, matched_parts
+from sceneprior.core.parts import CYLINDER, DOME, Parts, filled_cells, surface_of_parts
+from sceneprior.lifted.shape_morphing import blend_parts, matched_parts
 
 ROUND = Parts(
     np.array([CYLINDER, CYLINDER, DOME]), np.zeros(3, np.int64),
@@ -59,22 +59,3 @@ def test_the_way_back_is_the_way_there(first, second):
     for one, other in zip(there, back[::-1], strict=True):
         for here, same in zip(one, other, strict=True):
             np.testing.assert_array_equal(here, same)
-
-
-def test_corners_of_outlines_correspond_and_outlines_keep_their_area():
-    a, b = matched_outlines(SQUARE, SOFA.outline)
-    assert len(a) == len(b) >= 6
-    for matched, outline in ((a, SQUARE), (b, SOFA.outline)):
-        assert area(matched) == pytest.approx(area(outline), abs=1e-5)
-        apart = np.linalg.norm(matched[:, None] - outline, axis=2).min(axis=0)
-        assert apart.max() < 1e-5, "every corner is kept"
-    # The uncut corners of both are one point all the way.
-    kept = np.linalg.norm(a - b, axis=1) < 1e-6
-    for corner in ([-0.5, -0.5], [0.5, 0.5]):
-        assert (np.linalg.norm(a[kept] - corner, axis=1) < 1e-6).any()
-    assert matched_outlines(SQUARE, SQUARE)[0] is SQUARE
-
-
-def area(outline: np.ndarray) -> float:
-    x, z = outline.T
-    return float((x * np.roll(z, -1) - z * np.roll(x, -1)).sum() / 2)

@@ -42,16 +42,6 @@ def test_one_object_in_all_its_poses_is_one_prototype():
         assert np.allclose(shown[pose][:-3], pooled(grids[pose : pose + 1], 4).ravel())
 
 
-def test_an_odd_shape_is_a_prototype_but_no_common_one():
-    grids = np.stack([ODD] * 3 + [~ODD] * 2)
-    sizes, labels = np.stack([SIZE] * 5), np.ones(5, dtype=np.int64)
-    items, common = choose_prototypes(grids, sizes, labels, np.ones(5, dtype=bool), most=99)
-    assert (items < 3).tolist() == [True, False] and common.tolist() == [True, False]
-    # But a class has at least one.
-    _, alone = choose_prototypes(grids[:1], sizes[:1], labels[:1], np.ones(1, dtype=bool), most=99)
-    assert alone.tolist() == [True]
-
-
 def test_distances_are_those_of_a_loop():
     grids = RNG.random((3, CELLS, CELLS, CELLS)) < 0.5
     sizes = RNG.uniform(0.3, 2, (3, 3))

@@ -7,14 +7,14 @@ import pytest
 
 from sceneprior.core.boxes import box_iou_3d
 from sceneprior.core.shards import iterate_rooms
+from sceneprior.lifted.lifting import ShapeGrid
 from sceneprior.lifted.lifting.boxes import (
-    cells_along,
     draw_rays,
     lift_boxes,
     pass_through,
     smallest_box,
 )
-from sceneprior.lifted.lifting.hulls import MOST_EMPTY, NEVER, Hull, Sightings, carve
+from sceneprior.lifted.lifting.hulls import MOST_EMPTY, NEVER, Sightings, carve, lift_shapes
 
 MARGIN = 1.2
 
@@ -64,17 +64,6 @@ def test_carving_is_the_definition(rooms, item, reach):
     by_hand = emptiness_cell_by_cell(seen, low, high, 9, reach)
     np.testing.assert_allclose(hull.emptiness, by_hand, rtol=0, atol=1e-6)  # float32 shares
     assert 0 < (hull.emptiness < NEVER).sum() < hull.emptiness.size
-
-
-def test_rays_pass_the_cells_they_pass():
-    """Along x through the middle of a 4 x 4 x 4 grid, and one that misses it."""
-    emptiness = np.arange(64, dtype=np.float32).reshape(4, 4, 4) / 64
-    hull = Hull(np.zeros(3), np.full(3, 4.0), emptiness)
-    origins = np.array([[-1.0, 1.5, 2.5], [-1.0, 9.0, 2.5]])
-    where, found = cells_along(hull, origins, np.array([[1.0, 0, 0], [1.0, 0, 0]]), 4)
-    assert where[0].tolist() == [[x, 1, 2] for x in range(4)]
-    np.testing.assert_array_equal(found[0], emptiness[:, 1, 2])
-    assert (found[1] == NEVER).all()
 
 
 def test_passing_a_box_from_outside_inside_beside_and_along_a_side():
@@ -141,24 +130,34 @@ def test_the_smallest_box_is_that_of_single_steps(seed):
         assert one.tolist() == other.tolist()
 
 
-def test_a_hit_meets_the_true_box_and_a_span_without_one_is_empty(rooms):
-    """Toy furniture fills its boxes. A ray is cast from a pixel's centre, and so was the id."""
+def test_void_furniture_is_unknown_and_changes_no_box_and_no_hull_of_others(rooms):
+    """The last object's id becomes that of void. Fewer rays tell something of the others' shapes:
+    its box is not known."""
     views, truth = rooms[0]
-    boxes = lift_boxes(views)
-    pool = draw_rays(views, boxes, 300, MARGIN)
+    void = replace(
+        views, object_class=views.object_class[:-1],
+        **{name: getattr(views, name)[:, :-1] for name in
+           ("boxes", "visible", "sides_clear", "mask_pixels")},
+    )  # fmt: skip
+    boxes = lift_boxes(void)
+    for here, there in zip(boxes, lift_boxes(views), strict=True):
+        np.testing.assert_array_equal(here, there[:-1])
+    grid = ShapeGrid(cells=12, margin=MARGIN)
+    np.testing.assert_array_equal(
+        lift_shapes(void, boxes, grid), lift_shapes(views, lift_boxes(views), grid)[:-1]
+    )
+    pool = draw_rays(void, boxes, 300, MARGIN)
     for item in np.flatnonzero(boxes.explained > 0):
+        # Toy furniture fills its boxes. A ray is cast from a pixel's centre, and so was the id.
         scale = MARGIN * boxes.sizes_m[item] / 2
         spans = pool.spans[item] * scale
         length = np.linalg.norm(spans, axis=1)
         known = length > 0
         center_m, half_m = truth.centers_m[item].astype(float), truth.sizes_m[item] / 2.0
-        near, far = pass_through(
-            (pool.starts[item] * scale + boxes.centers_m[item])[known],
-            spans[known] / length[known, None],
-            center_m - half_m, center_m + half_m,
-        )  # fmt: skip
-        entered = np.where(far > near, near, np.inf)
+        starts = (pool.starts[item] * scale + boxes.centers_m[item])[known]
+        ways = spans[known] / length[known, None]
+        near, far = pass_through(starts, ways, center_m - half_m, center_m + half_m)
+        met = (far > near) & (near <= length[known] + 1e-3)
         hits = pool.hits[item][known]
         assert 0.1 < hits.mean() < 0.9, "rays teach both ways"
-        met = entered <= length[known] + 1e-3
         assert met[hits].mean() > 0.97 and (~met[~hits]).mean() > 0.97

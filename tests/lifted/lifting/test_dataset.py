@@ -48,6 +48,8 @@ def test_rows_and_objects_are_those_of_the_views_and_truth_is_not_needed(shards)
         assert torch.equal(getattr(mine, name), getattr(theirs, name))
     assert mine.room_ids == theirs.room_ids
     assert mine.looks is None
+    blank = lifted.__getitems__([(0, BLANK)])
+    assert not blank.is_object.any() and not blank.is_lifted.any()
 
 
 def test_turned_rows_are_turned_rooms(shards):
@@ -73,11 +75,6 @@ def test_what_has_no_label_or_no_box_has_no_look(shards):
     assert data.posed_prototypes(prototypes).tolist()[:2] == [-1, -1]
     data.assign_prototypes(prototypes)
     assert data.__getitems__([(0, 0)]).looks[0, :2].tolist() == [-1, -1]
-
-
-def test_a_blank_draw_is_a_room_in_which_there_is_nothing(shards):
-    batch = LiftedDataset(shards, "train", GRID).__getitems__([(0, BLANK)])
-    assert not batch.is_object.any() and not batch.is_lifted.any()
 
 
 def test_boxes_are_found_once_and_again_when_views_change(shards, monkeypatch):

@@ -41,15 +41,6 @@ def stability_of(found: Parts, hangs: bool) -> tuple[int, int, float]:
     return stability(found.mirrored, levels, area_table(found.outline, 64), hangs)
 
 
-def test_what_hangs_reaches_the_ceiling_and_what_stands_the_floor():
-    shade = boxes((8, 56, 20, 36, 8, 56))
-    for hangs in (False, True):
-        found = fitted(shade, hangs)
-        heights = np.stack([ends[1] for _, ends in found.solids()])
-        assert heights.max() == 0.5 if hangs else heights.min() == -0.5
-        assert stability_of(found, hangs)[:2] == (0, 1)
-
-
 def test_nothing_floats():
     """Masks show two mattresses of a bunk bed, but no posts; a lamp and its cap, but no cord."""
     found = fitted(boxes((0, 64, 8, 20, 0, 64), (0, 64, 48, 64, 0, 64)))

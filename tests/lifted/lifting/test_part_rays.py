@@ -9,8 +9,6 @@ from sceneprior.core.parts import ACROSS_X, ACROSS_Z, BOX, SQUARE, Parts, inside
 from sceneprior.lifted.lifting.part_loss import (
     RayFit,
     area_table,
-    outline_of,
-    points_within,
     stability,
 )
 from sceneprior.lifted.lifting.part_rays import (
@@ -103,11 +101,6 @@ def test_parts_that_float_fall_apart_or_tip_over(parts, mirrored, area, hangs, f
     assert stability(np.array(mirrored), np.array(parts), area, hangs) == found
 
 
-def test_an_area_table_counts_cells():
-    assert TRIANGLE[-1, -1] == pytest.approx(64 * 64 / 2, rel=0.02)
-    assert TRIANGLE[8, 8] == 64 and TRIANGLE[20, 4] == 80
-
-
 def test_wrong_rays_of_several_objects_are_counted_at_once():
     rays = rays_of(TABLE, 300)
     rays.spans[:5] = 0  # these tell nothing
@@ -136,19 +129,6 @@ def test_wrong_rays_of_several_objects_are_counted_at_once():
 
 
 L_SHAPE = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.0], [0.0, 0.0], [0.0, 0.5], [-0.5, 0.5]])
-CELLS = 30
-
-
-def test_an_outline_is_the_plan_of_the_hull():
-    middles = (np.arange(CELLS) + 0.5) / CELLS - 0.5
-    x, z = np.meshgrid(middles, middles, indexing="ij")
-    hull = np.zeros((CELLS,) * 3, bool)
-    hull[:, 4:9] = shapely.contains_xy(shapely.Polygon(L_SHAPE), x, z)[:, None]
-    found = outline_of(hull)
-    shape, wanted = shapely.Polygon(found), shapely.Polygon(L_SHAPE)
-    assert shape.symmetric_difference(wanted).area < 0.005
-    assert all(found[:, axis].tolist().count(side) == 2 for axis in (0, 1) for side in (-0.5, 0.5))
-    assert shapely.Polygon(found).exterior.is_ccw
 
 
 def test_rays_are_cut_to_where_they_are_within_the_outline():
@@ -172,10 +152,3 @@ def test_rays_are_cut_to_where_they_are_within_the_outline():
         np.testing.assert_allclose(cut_start, points[inside[0]], atol=1e-3)
         np.testing.assert_allclose(cut_start + cut_span, points[inside[-1]], atol=1e-3)
     assert 100 < met < 390
-
-
-def test_points_lie_within_and_cover_the_outline():
-    points = points_within(L_SHAPE, 500)
-    assert shapely.contains_xy(shapely.Polygon(L_SHAPE), points).all() and len(points) == 500
-    shares = [((points > 0) == signs).all(axis=1).mean() for signs in ([0, 0], [0, 1], [1, 0])]
-    assert min(shares) > 0.25

@@ -60,12 +60,3 @@ def test_objects_in_all_poses_teach_one_kind_and_are_known_again_by_their_rays()
     assert (looks[POSES:] // POSES == 1).all()
     nobody = explain_rays(kinds, rays, sizes_m, np.full(10, 3), MARGIN)
     assert (nobody == -1).all(), "no prototype of this class"
-
-
-def test_kinds_do_not_depend_on_the_order_in_which_they_are_fitted():
-    hulls, rays, sizes_m, classes = objects()
-    usable = np.ones(10, bool)
-    both = fit_prototypes(np.array([0, 8]), hulls, rays, sizes_m, classes, usable, ~usable, MARGIN)
-    alone = fit_prototypes(np.array([8]), hulls, rays, sizes_m, classes, usable, ~usable, MARGIN)
-    for here, there in zip(both[1], alone[0], strict=True):
-        np.testing.assert_array_equal(here, there)
