@@ -152,7 +152,7 @@ class ViewComparison(_Comparison):
 
 
 Comparison = RoomComparison | ViewComparison
-TASKS = {"new_rooms": RoomComparison, "single_views": ViewComparison}
+TASKS: dict[str, type[Comparison]] = {"new_rooms": RoomComparison, "single_views": ViewComparison}
 """Class of the comparison, by the value of the key `task`."""
 
 
@@ -287,7 +287,7 @@ def variants_of(comparison: Comparison, run: Run) -> list[Variant]:
     """
     title, config = comparison.methods[run.method].title, run.run_config
     names = comparison.variants(config) if config.remembers_rooms else (None,)
-    found = []
+    found = list[Variant]()
     for name in names:
         way = name
         if isinstance(comparison, ViewComparison):

@@ -7,24 +7,26 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Int
 
 from sceneprior.apps.api import load
-from sceneprior.core.classes import VOID, label_set
+from sceneprior.core.classes import label_set
 from sceneprior.core.dataset import ViewDataset, allowed_views
 from sceneprior.core.errors import InputError
 from sceneprior.core.ground_truth import known_in_3d, reference_scenes
-from sceneprior.core.scene import Scene
+from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.shards import iterate_rooms, list_shards
-from sceneprior.evaluation.metric import METHOD, Estimate, emptiness, mean_of_rooms, resample_counts
+from sceneprior.evaluation.metric import (
+    METHOD,
+    Comparison,
+    Estimate,
+    RoomSet,
+    emptiness,
+    resample_counts,
+)
 from sceneprior.evaluation.metrics import METRICS
 from sceneprior.evaluation.metrics.contents import (
-    TYPE_CLASSES,
-    category_kl,
-    class_counts,
     common_label_set,
     reconstruction_scores,
-    shared_volume_m3,
     without_void,
 )
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis, result_of, seeded_rows
@@ -39,6 +41,7 @@ from sceneprior.training.method import Trained
 VIEWS = 4
 """Number of views per training room in which decoded masks are compared."""
 _BATCH = 8
+_OF_COUNTS, _OF_BOXES = ("mean_objects", "type_share", "category_kl"), ("overlap_volume_m3",)
 _NOTE = (
     "The rooms of these shards are known from views alone: objects are counted as they appear in "
     "the views, and metrics that need 3D ground truth are left out."
@@ -210,34 +213,33 @@ def evaluate_from_views(
     """
     generated = [without_void(scene) for scene in generated]
     names = common_label_set(generated)
-    rooms = {split: _counted(shards, split, names) for split in ("train", options.split)}
-    counts = {
-        "generated": class_counts(generated), "train_rooms": rooms["train"],
-        "test": rooms[options.split],
+    scenes = {
+        "generated": generated, "train_rooms": _observed(shards, "train", names),
+        "test": _observed(shards, options.split, names),
     }  # fmt: skip
-    draws = {
-        name: resample_counts(len(table), options.resamples, (options.seed, number))
-        for number, (name, table) in enumerate(counts.items())
+    sets = {
+        name: RoomSet(rooms, {}, resample_counts(len(rooms), options.resamples, (options.seed, k)))
+        for k, (name, rooms) in enumerate(scenes.items())
     }
+    # These metrics read scenes alone, and those of counts only the classes of objects.
+    others = Comparison(sets["test"], [], [], [], options.seed, None, np.zeros((0, 0), bool), 0.0)
     columns: dict[str, dict[str, Estimate]] = {}
-    for name, table in counts.items():
-        found = {"mean_objects": mean_of_rooms(table.sum(axis=1), draws[name])}
-        if wanted := TYPE_CLASSES.get(names):
-            held = table[:, [label_set(names).index(label) for label in wanted]].any(axis=1)
-            found["type_share"] = mean_of_rooms(held.astype(float), draws[name], 1.0)
-        if name != "test":
-            found["category_kl"] = category_kl(table, counts["test"], draws[name], draws["test"])
-        columns[name] = found
+    for name, rooms in sets.items():
+        keys = [*_OF_COUNTS, *_OF_BOXES * (name == "generated")]
+        found = {
+            metric.key: metric.function(rooms, others)
+            for metric in METRICS
+            if metric.key in keys and name in metric.sets
+        }
+        columns[name] = {key: each for key, each in found.items() if each.value is not None}
     measured = columns["generated"]
-    volumes = [shared_volume_m3(scene) for scene in generated]
-    measured["overlap_volume_m3"] = mean_of_rooms(volumes, draws["generated"])
     return result_of(columns) | {
         "note": " ".join(filter(None, (emptiness(generated), _NOTE))),
         "protocol": {
             "label_set": names,
             "shards": Path(shards).resolve().name,
             "split": options.split,
-            **{f"n_{name}": len(table) for name, table in counts.items()},
+            **{f"n_{name}": len(rooms) for name, rooms in scenes.items()},
             "seed": options.seed,
             "resamples": options.resamples,
             "intervals": METHOD,
@@ -246,17 +248,16 @@ def evaluate_from_views(
     }
 
 
-def _counted(shards: Path, split: str, names: str) -> Int[np.ndarray, "rooms classes"]:
-    """Number of tracked objects of each class in each room, void left out."""
-    tables = []
+def _observed(shards: Path, split: str, names: str) -> list[Scene]:
+    """Rooms of the tracked objects of each room, which have classes but no boxes."""
+    scenes = []
     for shard, room_id in iterate_rooms(shards, split):
         if shard.label_set != names:
             raise InputError(
                 f"Scores compare scenes of one label set, but the scenes have '{names}' and "
                 f"{shards} has '{shard.label_set}'."
             )
-        labels = shard.read_room(room_id).object_class
-        tables.append(np.bincount(labels, minlength=len(label_set(names))))
-    table = np.stack(tables).astype(np.int64)
-    table[:, VOID] = 0
-    return table
+        labels = [label_set(names)[index] for index in shard.read_room(room_id).object_class]
+        objects = [SceneObject(label, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)) for label in labels]
+        scenes.append(without_void(Scene(room_id, names, tuple(objects))))
+    return scenes

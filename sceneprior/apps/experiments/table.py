@@ -97,9 +97,10 @@ def rows_of(comparison: Comparison, run: Run) -> list[Row]:
     """The rows of an evaluated run; the first row includes the costs of training."""
     found = {variant: read_result(variant.result) for variant in variants_of(comparison, run)}
     of_task = _rows_of_views if isinstance(comparison, ViewComparison) else _rows_of_rooms
+    title = comparison.rooms[run.rooms].title
     rows = [
-        Row(comparison.rooms[run.rooms].title, run.seed, variant.title, variant.made_by, *rest)
-        for variant, *rest in of_task(found, run.run_config.learns_from)
+        Row(title, run.seed, of.title, of.made_by, variant, scores, group, rank)
+        for of, variant, scores, group, rank in of_task(found, run.run_config.learns_from)
     ]
     rows[0].scores.update(costs_of(run))
     return rows

@@ -192,7 +192,7 @@ def _labels_of_shards(folder: Path, label_set_name: str) -> dict[str, str]:
 
 def _own_models(folder: Path, label_set_name: str) -> _ModelFiles:
     """Models in sub-folders by class; a folder with an unknown class name gives a warning."""
-    labels = {}
+    labels = dict[str, str]()
     for home in sorted(path for path in folder.iterdir() if path.is_dir()):
         files = sorted(path for path in home.iterdir() if path.suffix.lower() in (".glb", ".obj"))
         label = class_of_folder(home.name, label_set_name)
