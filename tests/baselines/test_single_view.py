@@ -10,7 +10,7 @@ from torch.testing import assert_close
 
 from sceneprior.apps.config import load_any_run
 from sceneprior.apps.reconstruction.reconstruct import FitOptions, reconstruct
-from sceneprior.baselines.single_view.detections import CROP, detections_of, some_views
+from sceneprior.baselines.single_view.detections import detections_of, some_views
 from sceneprior.baselines.single_view.detector import (
     BIN,
     BINS,
@@ -45,21 +45,6 @@ def moved(views: SceneViews, quarter: int, shift_m: tuple[float, float]) -> Scen
     offset = poses[..., 3:].clone()
     offset[..., :3, 0] -= turned[..., :3, :] @ shift
     return replace(views, world_to_camera=torch.cat([turned, offset], dim=-1))
-
-
-def test_a_crop_shows_the_mask_and_those_beside_it(views):
-    found = detections_of(views)
-    own, others, inside = found.crops[:, 0], found.crops[:, 1], found.crops[:, 2]
-    assert set(found.crops[:, :3].unique().tolist()) == {0.0, 1.0}
-    assert not (own * others).any() and not (own * (1 - inside)).any()
-    # The box is the middle half of the crop along each side, once the margins are a quarter each.
-    sides = (found.boxes[:, 2:] - found.boxes[:, :2]).amin(dim=-1)
-    large = sides > 0.2
-    low, high = round(CROP / 6), round(CROP * 5 / 6)
-    within = own[:, low:high, low:high].sum(dim=(1, 2))
-    assert (within[large] >= 0.9 * own[large].sum(dim=(1, 2))).all()
-    lengths = found.crops[:, 3:].norm(dim=1)
-    assert_close(lengths, torch.ones_like(lengths), rtol=0, atol=1e-5)
 
 
 def test_what_is_told_moves_and_turns_with_the_room(views):

@@ -6,10 +6,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from sceneprior.core.proxies import icosphere, to_cube
 from sceneprior.paper.config import PaperModel
 from sceneprior.paper.decoders import (
-    ClassBevels,
     LayoutDecoder,
     SeparateHeads,
     ShapeDecoder,
@@ -65,20 +63,6 @@ def test_separate_heads_give_each_coordinate_an_mlp(torch_rng):
             assert_close(out[room, item], torch.stack(wanted), rtol=0, atol=1e-12)
 
 
-def test_without_void_it_is_never_likely_and_the_rest_is_as_it_was(torch_rng):
-    torch.manual_seed(0)
-    model = LayoutDecoder(16, 5)
-    x = torch.randn(3, 4, 16, generator=torch_rng)
-    plain, _ = model(x)
-    model.void = False
-    layout, _ = model(x)
-    assert (layout.class_logits[..., 0] == -torch.inf).all()
-    assert torch.equal(layout.class_logits[..., 1:], plain.class_logits[..., 1:])
-    layout.class_logits.softmax(dim=-1).square().sum().backward()
-    last = model.mlp2[-1].weight
-    assert (last.grad[0] == 0).all() and (last.grad[1:5] != 0).any() and last.grad.isfinite().all()
-
-
 def test_the_layout_is_what_supplement_a_says(torch_rng):
     """MLP2(MLP1(x)), then SoftPlus on sizes and ReLU on y, one object at a time."""
     torch.manual_seed(1)
@@ -114,33 +98,6 @@ def test_above_the_floor_is_relu_and_keeps_the_gradient_that_lifts():
     upstream = torch.tensor([-3.0, 3.0, -3.0, -3.0, 3.0])
     (above * upstream).sum().backward()
     assert y.grad.tolist() == [-3.0, 0.0, -3.0, -3.0, 3.0]
-
-
-def test_a_sure_class_has_its_own_chamfers_and_an_unsure_one_the_mean():
-    table = ClassBevels(3)
-    with torch.no_grad():
-        table.logits.copy_(torch.tensor([[-2.0, 0], [0, 2], [3, -3]]))
-    mixed = torch.tensor([[[0.0, 200, 0], [50, 50, -200]]])
-    own = torch.sigmoid(torch.tensor([[0.0, 2], [-2, 0]]))
-    half = (torch.tensor([0.5, torch.tensor(2.0).sigmoid()]) + own[1]) / 2
-    found = table(mixed.requires_grad_())
-    assert_close(found[0], torch.stack([own[0], half]))
-    found.sum().backward()  # classes learn nothing from how boxes look
-    assert mixed.grad is None and table.logits.grad.any()
-
-
-@pytest.mark.parametrize("template", ["sphere", "box"])
-def test_deformation_starts_from_the_plain_template(torch_rng, template):
-    torch.manual_seed(0)
-    model = ShapeDecoder(32, ShapeDecoderConfig(width=16, level=1, template=template))
-    meshes = model(torch.randn(3, 4, 32, generator=torch_rng))
-    sphere, faces = icosphere(1)
-    wanted = sphere if template == "sphere" else to_cube(sphere)
-    assert torch.equal(model.faces, faces)
-    assert meshes.shape == (3, 4, 42, 3)
-    # 1% of the box's half: the last layer's weights are scaled by 0.01.
-    assert_close(meshes, wanted.expand(3, 4, -1, -1), rtol=0, atol=0.01)
-    assert not torch.equal(meshes[0, 0], meshes[0, 1])
 
 
 def test_fit_box_fills_the_unit_box_exactly(torch_rng):

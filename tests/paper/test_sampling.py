@@ -144,12 +144,3 @@ def test_a_scene_ends_at_the_first_object_whose_completeness_falls(decoded, prio
         np.testing.assert_array_equal(item.size_m, decoded.sizes_m[0, source])
         np.testing.assert_array_equal(item.mesh.vertices_m, decoded.vertices_m[0, source])
         np.testing.assert_array_equal(item.mesh.faces, prior.shape.faces)
-
-
-def test_a_stop_flag_ends_a_scene_after_the_object_that_has_it(decoded, prior):
-    stops = replace(
-        decoded, completeness_logits=torch.tensor([[-2.0, 0.1, -5, 3], [-1, -1, -1, -1]])
-    )
-    first, second = to_rooms(stops, prior, "front3d_bedroom", ["a", "b"], "stop")
-    assert labels(first.scene) == ["double_bed", "nightstand"]
-    assert labels(second.scene) == ["double_bed", "nightstand", "wardrobe"]

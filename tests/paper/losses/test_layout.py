@@ -1,14 +1,11 @@
 """The layout terms against loops in Python floats, and their gradients against differences."""
 
-import itertools
 from dataclasses import replace
 
 import pytest
 import torch
 from references import losses as by_hand
-from torch.testing import assert_close
 
-from sceneprior.baselines.semantic_maps import kept_share
 from sceneprior.core.boxes import box_corners
 from sceneprior.core.cameras import boxes_of_points
 from sceneprior.paper.losses import (
@@ -22,7 +19,6 @@ from sceneprior.paper.losses import (
     take,
 )
 from sceneprior.paper.matching import match_objects
-from sceneprior.paper.prior import ModelConfig
 from sceneprior.paper.settings import LossConfig
 
 OVERSHOOT = (1.0, 0.3)
@@ -127,9 +123,6 @@ def test_every_layout_term_passes_gradcheck(batch):
         assert torch.autograd.gradcheck(term, leaves, eps=1e-7, atol=1e-6), term.__name__
 
 
-CONVENTIONS = ModelConfig.model_fields["completeness_target"].annotation.__args__
-
-
 def test_the_two_conventions_written_out():
     """Targets keep the real objects; one word of a scene counts. `stop` has no empty rooms."""
     for convention, targets, kept in (
@@ -145,20 +138,3 @@ def test_the_two_conventions_written_out():
         logits = torch.tensor([[2.0, 0.1, -0.1, 5.0], [-1, -2, 3, -1]])
         assert kept_objects(logits, convention).int().tolist() == kept
     assert kept_objects(-torch.ones(1, 4), "stop").all()  # nobody says stop
-
-
-@pytest.mark.parametrize("convention", CONVENTIONS)
-def test_the_share_kept_is_the_chance_that_a_scene_drawn_by_the_scores_goes_on(
-    convention, torch_rng
-):
-    scores = torch.rand(2, 5, generator=torch_rng, dtype=torch.float64)
-    share = kept_share(scores, convention)
-    for room in range(2):
-        wanted = torch.zeros(5, dtype=torch.float64)
-        for words in itertools.product((0, 1), repeat=5):  # every way to say yes and no
-            said = torch.tensor(words, dtype=torch.float64)
-            chance = (said * scores[room] + (1 - said) * (1 - scores[room])).prod()
-            wanted += chance * kept_objects(said[None] - 0.5, convention)[0]
-        assert_close(share[room], wanted, rtol=0, atol=1e-12)
-    inputs = scores[:, :3].requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: kept_share(x, convention), inputs)
