@@ -94,21 +94,6 @@ def test_shards_of_version_1_are_read_and_those_of_the_future_are_not(tmp_path):
         Shard(tmp_path / "a.h5")
 
 
-def test_damaged_pixels_name_the_room(tmp_path):
-    path = tmp_path / "a.h5"
-    write_shard(path, "front3d_bedroom", [(make_room(size=(120, 160)), make_truth())])
-    with h5py.File(path) as file:
-        chunk = file["rooms/house_A/instance_ids"].id.get_chunk_info(1)
-    data = bytearray(path.read_bytes())
-    data[chunk.byte_offset : chunk.byte_offset + chunk.size] = bytes(chunk.size)
-    path.write_bytes(data)
-    with Shard(path) as shard:
-        shard.read_room("house_A")
-        shard.read_instance_ids("house_A", [0])
-        with pytest.raises(ShardError, match=r"a\.h5, room house_A cannot be read"):
-            shard.read_instance_ids("house_A", [1])
-
-
 def test_a_checksum_covers_everything_and_survives_the_file(tmp_path):
     room, truth = with_stuff(make_room()), make_truth()
     room = replace(room, turned_deg=12.5, room_from_world=np.eye(4))

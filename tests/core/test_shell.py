@@ -6,10 +6,8 @@ import shapely
 import trimesh
 from rooms_of_solids import solid_box
 
-from sceneprior.core.boxes import yaw_rotation
 from sceneprior.core.scene import Opening, Scene
 from sceneprior.core.shell import THICK_M, Shell, shell_of
-from sceneprior.render.scene_simulators import boxes_of_wall
 
 SQUARE = np.array([[-2.0, -1.5], [2.0, -1.5], [2.0, 1.5], [-2.0, 1.5]])
 L = np.array([[-2.5, -2], [2.5, -2], [2.5, 0.5], [0.5, 0.5], [0.5, 2.2], [-2.5, 2.2]])
@@ -42,35 +40,6 @@ def test_every_mesh_is_closed_and_outside_the_room(outline):
     plan = [shapely.convex_hull(shapely.MultiPoint(wall.vertices[:, ::2])) for wall in walls]
     assert shapely.union_all(plan).symmetric_difference(whole - floor).area < 1e-6
     assert sum(each.area for each in plan) == pytest.approx((whole - floor).area)
-
-
-def test_doors_and_windows_are_holes():
-    shell = shell_of(room(L, openings=(DOOR, WINDOW), ceiling_m=2.5))
-    bare = shell_of(room(L, ceiling_m=2.5))
-    cut = {"wall_0": 0.9 * 2.0, "wall_5": 2.0 * 1.2}
-    for row in range(6):
-        name = f"wall_{row}"
-        lost = solid(bare, name).volume - solid(shell, name).volume
-        assert lost == pytest.approx(cut.get(name, 0) * THICK_M, abs=1e-9)
-        assert solid(shell, name).is_volume
-
-
-def test_boxes_fill_the_walls_round_their_openings():
-    """The boxes lie in the wall's mesh, and their areas add up."""
-    shell = shell_of(room(SLANTED, openings=(DOOR, WINDOW)))
-    for row, wall in enumerate(shell.walls):
-        holes = sum((end - start) * (top - bottom) for start, end, bottom, top in wall.openings)
-        boxes = list(boxes_of_wall(wall, shell.height_m))
-        area = sum(4 * half[0] * half[2] for _, half in boxes)
-        assert area == pytest.approx(wall.length_m * shell.height_m - holes)
-        mesh = solid(shell, f"wall_{row}")
-        for center, half in boxes:
-            turned = np.eye(4)
-            turned[:3, :3] = yaw_rotation(np.arctan2(-wall.direction[1], wall.direction[0]))
-            turned[:3, 3] = center
-            there = trimesh.creation.box(2 * half[[0, 2, 1]], turned)
-            inside = trimesh.boolean.intersection([mesh, there])
-            assert inside.volume == pytest.approx(8 * np.prod(half), rel=1e-5)
 
 
 @pytest.mark.parametrize("outline", [SQUARE, L, SLANTED])

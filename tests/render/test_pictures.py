@@ -9,15 +9,6 @@ def plain(height, width, value):
     return np.full((height, width, 3), value, dtype=np.uint8)
 
 
-def test_tiles_stand_in_rows_and_the_rest_is_white():
-    sheet = contact_sheet([plain(4, 6, 10), plain(2, 6, 20), plain(4, 3, 30)], columns=2)
-    assert sheet.shape == (8, 12, 3) and sheet.dtype == np.uint8
-    assert (sheet[:4, :6] == 10).all() and (sheet[:2, 6:] == 20).all()
-    assert (sheet[4:, :3] == 30).all()
-    assert (sheet[2:4, 6:] == 255).all() and (sheet[4:, 3:] == 255).all()
-    assert contact_sheet([plain(4, 6, 10)], columns=3).shape == (4, 18, 3)
-
-
 def test_gaps_and_captions_are_beside_the_tiles():
     tiles = [plain(30, 40, 10)] * 3
     sheet = contact_sheet(tiles, 2, ["one", "two", "three"], gap_px=5)
