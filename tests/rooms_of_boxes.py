@@ -10,12 +10,11 @@ from sceneprior.core.parts import Parts, filled_cells
 from sceneprior.core.wall_lines import Wall
 from sceneprior.lifted.lifting import LiftedBoxes, RayPool, ShapeGrid
 from sceneprior.lifted.lifting.dataset import LiftedDataset
-from sceneprior.lifted.prototype_decoder import PrototypeConfig, PrototypeDecoder
 from sceneprior.lifted.sampler.network import RoomSampler, SamplerConfig
 from sceneprior.lifted.sampler.prototype_statistics import teach
 from sceneprior.lifted.sampler.rooms import SamplerRooms
 
-CLASSES, CODES, CELLS, PROTOTYPES = 5, 7, 8, 12
+CLASSES, CELLS, PROTOTYPES = 5, 8, 12
 RAYS = 400
 TINY = {"epochs": 2, "width": 16, "layers": 1, "heads": 2, "dropout": 0.0}
 
@@ -69,14 +68,6 @@ def sampler_rooms(count: int = 6, seed: int = 0) -> SamplerRooms:
     return SamplerRooms(lifted_rooms(count, seed)).assign_prototypes(
         lifted_rooms().find_prototypes(99)
     )
-
-
-def small_decoder() -> PrototypeDecoder:
-    """A decoder that knows the shapes above."""
-    config = PrototypeConfig(prototypes=PROTOTYPES, codes=CODES, width=8, cells=CELLS, margin=1.0)
-    decoder = PrototypeDecoder(4, config)
-    decoder.set_prototypes(lifted_rooms().find_prototypes(99))
-    return decoder
 
 
 def small_sampler(rooms: SamplerRooms, seed: int = 0, **settings: object) -> RoomSampler:

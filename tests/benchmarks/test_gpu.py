@@ -4,38 +4,9 @@ import json
 from pathlib import Path
 
 import gpu
-import gpu_parts
 import pytest
-from gpu_parts import TINY, Setup
 
 ON_CPU = ["--device", "cpu", "--tiny"]
-
-
-class Notes(dict[str, dict[str, float]]):
-    """Rows of one part, measured here and not in a process of its own."""
-
-    def __init__(self, part, folder: Path):
-        super().__init__()
-        part(Setup("cpu", TINY, folder, self.__setitem__))
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory, toy_shards: Path) -> Path:
-    """A folder of parts whose homes are toy rooms."""
-    path = tmp_path_factory.mktemp("gpu")
-    (path / "shards").symlink_to(toy_shards)
-    return path
-
-
-def test_the_schedule_is_extrapolated(folder: Path):
-    rows = Notes(gpu_parts.schedule, folder)
-    layout, shape, whole = rows.values()
-    for stage, epochs in ((layout, 800), (shape, 500)):
-        assert 0 < stage["step_s"] < stage["epoch_s"] < stage["first_epoch_s"] * 100
-        # 3,530 rooms in four turns, at the rate of the toy rooms.
-        hours = epochs * 3530 * 4 / stage["rooms_per_s"] / 3600
-        assert stage["whole_h"] == pytest.approx(hours)
-    assert whole == {"whole_h": pytest.approx(layout["whole_h"] + shape["whole_h"])}
 
 
 def test_a_part_that_fails_or_hangs_is_a_line_and_the_next_one_runs(tmp_path: Path):
