@@ -12,6 +12,7 @@ from front_files import FrontFolder, bedroom, four_models
 from data_prep.engine.build import Job, build_shards
 from data_prep.front.recipe import load_recipe
 from data_prep.front.source import FrontSource
+from data_prep.homes.make import make_homes
 from sceneprior.core.shard_writing import room_checksum
 from sceneprior.core.shards import Shard
 
@@ -44,6 +45,14 @@ def six_bedrooms_shards(folder: Path, *rules: str) -> None:
     front = four_models(folder.parent / f"{folder.name}.data")
     three_houses(front)
     build_shards(front_job(front, folder, rules=rules))
+
+
+def homes_shards(folder: Path, rooms: int, *rules: str, seed: int = 0) -> None:
+    """Shards of bedrooms made from a seed."""
+    data = folder.parent / f"{folder.name}.data"
+    make_homes(data, rooms, "bedroom", seed)
+    source = FrontSource(data / "3D-FRONT", data / "3D-FUTURE-model", load_recipe("bedroom", rules))
+    build_shards(Job(source, folder, renderer="software"))
 
 
 def digests(folder: Path, *patterns: str) -> dict[str, str]:
