@@ -29,18 +29,14 @@ def open_reader(name: str, folder: Path, recipe: str | None = None, **settings: 
         raise InputError(f"No folder at {folder}; expected the scenes of {name}.")
     if name not in DATA_SETS:
         raise InputError(f"No data set is called '{name}'; choose from {', '.join(DATA_SETS)}.")
-    reader: Reader
     if name == BlenderProc.name:
-        reader = BlenderProc(folder, recipe=load_recipe(recipe or "bedroom"), **settings)
+        settings["recipe"] = load_recipe(recipe or "bedroom")
     elif recipe is not None:
         raise InputError(
             f"--recipe selects rooms of 3D-FRONT, so it is not for {name}; leave it out."
         )
-    else:
-        classes: dict[str, type[Reader]] = {
-            each.name: each for each in (Hypersim, Structured3D, ScanNetPP)
-        }
-        reader = classes[name](folder, **settings)
+    classes: tuple[type[Reader], ...] = (BlenderProc, Hypersim, Structured3D, ScanNetPP)
+    reader = {each.name: each for each in classes}[name](folder, **settings)
     if not reader.scenes():
         raise InputError(f"{folder} holds no scene of {name}; docs/public_data.md shows the files.")
     return reader

@@ -112,7 +112,14 @@ class BlenderProc(Reader):
     def read(self, task: RoomTask) -> FramedRoom:
         """Read the frames of one room; other rooms' furniture, behind doors, is unknown."""
         paths = [self.folder / task.house / name for name in task.extra["frames"]]
-        poses = np.stack([_read_pose(path) for path in paths])
+        read = [(path, *read_hdf5(path, ("cam_Ts",), _HINT)) for path in paths]
+        for path, pose in read:
+            if pose.size != 16 or pose.dtype.kind not in "fiu":
+                raise InputError(
+                    f"{path}: cam_Ts is {shown(pose.shape)}, not a 4 x 4 matrix; {_HINT}."
+                )
+        # Blender's world and OpenGL's camera axes, metres.
+        poses = np.stack([pose.reshape(4, 4).astype(np.float64) for _, pose in read])
         frames, notes = choose_frames(task.room_id, poses, range(len(paths)), self.max_views)
         categories = _categories(self.folder)
         numbers: dict[str, int] = {}
@@ -166,14 +173,6 @@ def _read_frame(path: Path) -> tuple[np.ndarray, list[_Part]]:
             f"each mesh ({reason}); {_HINT}."
         ) from None
     return image, [part for part in parts if part.inst_mark and "layout" not in part.inst_mark]
-
-
-def _read_pose(path: Path) -> np.ndarray:
-    """Camera to world of a frame, (4, 4): Blender's world and OpenGL's camera axes, metres."""
-    (pose,) = read_hdf5(path, ("cam_Ts",), _HINT)
-    if pose.size != 16 or pose.dtype.kind not in "fiu":
-        raise InputError(f"{path}: cam_Ts is {shown(pose.shape)}, not a 4 x 4 matrix; {_HINT}.")
-    return pose.reshape(4, 4).astype(np.float64)
 
 
 def _intrinsics(folder: Path) -> np.ndarray:

@@ -47,27 +47,38 @@ class _Votes(NamedTuple):
     weight: Float[np.ndarray, " votes"]
     view: Int[np.ndarray, " votes"]
 
-    def half(self, which: int) -> "_Votes":
-        """Votes of every second view, starting at view `which`."""
-        return _Votes(*(part[self.view % 2 == which] for part in self))
-
 
 def find_turn(views: RoomViews) -> float | None:
     """Find the angle in degrees by which a room must turn about +y, so that most of its edges run
     along x and z: from -45 to 45, 0 for a room that is aligned to `ALIGNED_DEG`.
 
-    `views` must include the images of ids; y points up. None if the direction is uncertain: too few
-    edges, two directions, or different directions in different views. The angle is rounded to 0.01
-    degrees, so that it does not depend on the last bits of sums.
+    Outlines of objects (void included) and stuff vote, in evenly spread views. `views` must include
+    the images of ids; y points up. None if the direction is uncertain: too few edges, two
+    directions, or different directions in different views. The angle is rounded to 0.01 degrees, so
+    that it does not depend on the last bits of sums.
     """
-    votes = _votes_of_room(views)
-    whole, *halves = (_most_voted(part) for part in (votes, votes.half(0), votes.half(1)))
-    if whole is None or whole.second > SECOND:
+    assert views.instance_ids is not None, "read with images"
+    count = len(views.world_to_camera)
+    rows = np.unique(np.linspace(0, count - 1, min(count, _VIEWS)).round().astype(int))
+    step = max(1, round(max(views.image_size) / _SIDE_PX))
+    layers = [(views.instance_ids[(..., *thinned(step))], step)]
+    if views.stuff is not None:
+        layers.append((views.stuff, stuff_step(views.image_size)))
+    found = [
+        _votes_of_image(images[row], views.world_to_camera[row], K[row], place)
+        for images, step in layers
+        for K in [thinned_intrinsics(views.intrinsics, step)]
+        for place, row in enumerate(rows)
+    ]
+    votes = _Votes(*(np.concatenate(part) for part in zip(*found, strict=True)))
+    halves = [_Votes(*(part[votes.view % 2 == half] for part in votes)) for half in (0, 1)]
+    whole, *others = (_most_voted(part) for part in (votes, *halves))
+    if whole is None or whole[1] > SECOND:
         return None
-    for half in halves:
-        if half is None or abs(_folded(half.yaw_rad - whole.yaw_rad)) > np.radians(AGREE_DEG):
+    for half in others:
+        if half is None or abs(_folded(half[0] - whole[0])) > np.radians(AGREE_DEG):
             return None
-    degrees = round(float(-np.degrees(_folded(whole.yaw_rad))), 2)
+    degrees = round(float(-np.degrees(_folded(whole[0]))), 2)
     return degrees if abs(degrees) > ALIGNED_DEG else 0.0
 
 
@@ -88,24 +99,6 @@ def note_of_turn(degrees: float | None) -> list[str]:
 def _folded(yaw_rad: Any) -> Any:
     """Reduce an angle to -45 to 45 degrees by adding whole quarter turns."""
     return (yaw_rad + _QUARTER / 2) % _QUARTER - _QUARTER / 2
-
-
-def _votes_of_room(views: RoomViews) -> _Votes:
-    """Votes of the outlines of objects (void included) and stuff, in evenly spread views."""
-    assert views.instance_ids is not None, "read with images"
-    count = len(views.world_to_camera)
-    rows = np.unique(np.linspace(0, count - 1, min(count, _VIEWS)).round().astype(int))
-    step = max(1, round(max(views.image_size) / _SIDE_PX))
-    layers = [(views.instance_ids[(..., *thinned(step))], step)]
-    if views.stuff is not None:
-        layers.append((views.stuff, stuff_step(views.image_size)))
-    found = [
-        _votes_of_image(images[row], views.world_to_camera[row], K[row], place)
-        for images, step in layers
-        for K in [thinned_intrinsics(views.intrinsics, step)]
-        for place, row in enumerate(rows)
-    ]
-    return _Votes(*(np.concatenate(part) for part in zip(*found, strict=True)))
 
 
 def _votes_of_image(
@@ -154,15 +147,9 @@ def _votes_of_image(
     return _Votes(yaw_rad, weight, np.full(len(weight), view))
 
 
-class _Direction(NamedTuple):
-    """The most frequent direction, and the votes of the second as a share of the first's."""
-
-    yaw_rad: float
-    second: float
-
-
-def _most_voted(votes: _Votes) -> _Direction | None:
-    """Average the votes near the most frequent direction; None without votes."""
+def _most_voted(votes: _Votes) -> tuple[float, float] | None:
+    """The most frequent direction, averaged over the votes near it, as a yaw in radians; and the
+    votes of the second as a share of the first's. None without votes."""
     if not len(votes.weight):
         return None
     bins = np.floor(votes.yaw_rad % _QUARTER * (_BINS / _QUARTER)).astype(np.int64) % _BINS
@@ -175,4 +162,4 @@ def _most_voted(votes: _Votes) -> _Direction | None:
         off = _folded(votes.yaw_rad - yaw_rad)
         near = np.abs(off) < np.radians(_NEAR_DEG)
         yaw_rad += float(np.average(off[near], weights=votes.weight[near]))
-    return _Direction(yaw_rad, float(smooth[apart].max() / smooth[top]))
+    return yaw_rad, float(smooth[apart].max() / smooth[top])

@@ -59,7 +59,12 @@ class Hypersim(Reader):
         scene = self.folder / task.house
         size, cam_from_uv = _camera(self.folder / CAMERAS, task.house)
         intrinsics, tilt = pinhole(cam_from_uv, size)
-        unit = _metres_per_unit(scene / "_detail" / "metadata_scene.csv")
+        path = scene / "_detail" / "metadata_scene.csv"
+        settings = {row.get("parameter_name"): row for row in read_records(path, _HINT)}
+        row = settings.get("meters_per_asset_unit", {})
+        unit = float(_numbers(row, ["parameter_value"], f"{path}, meters_per_asset_unit,")[0])
+        if unit <= 0:
+            raise InputError(f"{path}: meters_per_asset_unit is {unit:g}; it is damaged.")
         images, poses = _trajectories(scene, unit)
         with_ids = [k for k, paths in enumerate(images) if all(path.is_file() for path in paths)]
         frames, notes = choose_frames(str(scene), poses, with_ids, self.max_views)
@@ -121,15 +126,6 @@ def _numbers(row: dict[str, str], names: list[str], where: str) -> np.ndarray:
     if not np.isfinite(values).all():
         raise InputError(f"{where} has no numbers in {names[0]} to {names[-1]}; it is damaged.")
     return values
-
-
-def _metres_per_unit(path: Path) -> float:
-    rows = {row.get("parameter_name"): row for row in read_records(path, _HINT)}
-    row = rows.get("meters_per_asset_unit", {})
-    (value,) = _numbers(row, ["parameter_value"], f"{path}, meters_per_asset_unit,")
-    if value <= 0:
-        raise InputError(f"{path}: meters_per_asset_unit is {value:g}; it is damaged.")
-    return float(value)
 
 
 def _trajectories(scene: Path, unit: float) -> tuple[list[tuple[Path, Path]], np.ndarray]:

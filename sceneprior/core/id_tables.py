@@ -177,9 +177,9 @@ def png_kind(data: bytes) -> tuple[int, str] | None:
     return data[24], _COLORS.get(data[25], "unknown colours")
 
 
-def mask_size(path: Path) -> tuple[int, int]:
+def mask_size(path: Path, rgb: bool = False) -> tuple[int, int]:
     """Read the size of a mask, (height, width), without its pixels."""
-    with _open(path, rgb=False) as picture:
+    with _open(path, rgb) as picture:
         return picture.height, picture.width
 
 

@@ -2,10 +2,10 @@
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from sceneprior.core.classes import VOID
 from sceneprior.core.coco import check_size, decode, paint
 from sceneprior.core.errors import InputError
 from sceneprior.core.id_tables import LARGEST_ID, IdTable, read_mask
+from sceneprior.core.observations import thinned_stuff
 
 PANOPTIC = "panoptic.json"
 TABLES = ("classes.json", "classes.csv", PANOPTIC)
@@ -168,55 +169,40 @@ def _some(words: list[str]) -> str:
     return ", ".join(words[:_LISTED]) + (", ..." if len(words) > _LISTED else "")
 
 
-class ReadMasks(NamedTuple):
-    """All masks of a room as `observe` takes them."""
-
-    ids: np.ndarray
-    """(views, height, width) unsigned: k + 1 for object k, n + 1 for what is unknown."""
-    object_class: np.ndarray
-    """(n + 1,), the last one is VOID."""
-    stuff: np.ndarray
-    """(views, height, width) indices into `STUFF`."""
-    intrinsics: np.ndarray
-    """(views, 3, 3)."""
-    notes: list[str]
-
-
 def read_tracked(
     masks: MaskFormat, frames: list[PosedFrame], size: tuple[int, int], stored: tuple[int, int]
-) -> ReadMasks:
-    """Read masks whose ids are the same in all frames; see `_Pixels`."""
+) -> dict[str, Any]:
+    """Read masks whose ids are the same in all frames, as fields of a `FramedRoom`; see `_pixels`.
+
+    An `InputError` if most ids occur in one frame only, as if each frame had its own ids.
+    """
     table = IdTable(masks.classes(), masks.label_set_name, str(masks.folder))
-    pixels = _Pixels(masks, size, stored)
-    ids, stuff, intrinsics = [], [], []
-    for frame in frames:
-        values, K = pixels.read(frame)
-        ids.append(table.ids(values))
-        stuff.append(table.stuff(values))
+    of_lenses: list[str] = []
+    images, stuff, intrinsics = [], [], []
+    frames_of = np.zeros(len(table.classes) + 1, dtype=np.int64)
+    for values, K in _pixels(masks, frames, size, stored, of_lenses):
+        images.append(table.ids(values))
+        frames_of[np.unique(images[-1])] += 1
+        stuff.append(thinned_stuff(table.stuff(values)))
         intrinsics.append(K)
     notes = [*masks.notes, *table.notes]
     if table.unlisted:
         listed = ", ".join(map(str, sorted(table.unlisted)[:20]))
         notes.append(f"masks show ids that the table of classes does not have ({listed}): void")
-    images = np.stack(ids)
-    _check_tracked(images, len(table.classes))
-    arrays = np.stack(stuff), np.stack(intrinsics)
-    return ReadMasks(images, table.classes, *arrays, notes + pixels.notes)
-
-
-def _check_tracked(images: np.ndarray, void: int) -> None:
-    """Raise an `InputError` if most ids occur in one frame only, as if each frame had its own
-    ids."""
-    frames_of = np.zeros(void + 1, dtype=np.int64)
-    for image in images:
-        frames_of[np.unique(image)] += 1
-    frames_of = frames_of[1:void]  # without the background and without masks of no class
+    frames_of = frames_of[1:-1]  # without the background and without masks of no class
     count, once = int((frames_of > 0).sum()), int((frames_of == 1).sum())
     if len(images) >= _MANY_FRAMES and count >= _MANY_IDS and once > _ONCE * count:
         raise InputError(
             f"{once} of its {count} ids are in one of {len(images)} frames only, expected the same "
             "id for an object in all frames; --tracks auto finds the objects of such masks."
         )
+    return {
+        "ids": np.stack(images),
+        "object_class": table.classes,
+        "stuff": np.stack(stuff),
+        "intrinsics": np.stack(intrinsics),
+        "notes": (*notes, *of_lenses),
+    }
 
 
 def read_untracked(
@@ -225,12 +211,11 @@ def read_untracked(
     size: tuple[int, int],
     stored: tuple[int, int],
     world_to_camera: np.ndarray,
-) -> ReadMasks:
+) -> dict[str, Any]:
     """Read masks whose ids and classes belong to single frames, and find the objects they show."""
-    pixels = _Pixels(masks, size, stored)
-    images, intrinsics = (
-        np.stack(arrays) for arrays in zip(*map(pixels.read, frames), strict=True)
-    )
+    of_lenses: list[str] = []
+    pixels = zip(*_pixels(masks, frames, size, stored, of_lenses), strict=True)
+    images, intrinsics = (np.stack(arrays) for arrays in pixels)
     # Masks of all frames are numbered through.
     numbers = np.where(images < 0, -1, 0)
     class_names: dict[int, str] = {}
@@ -256,63 +241,43 @@ def read_untracked(
     # The table's last id stands for masks without a class, whose content is unknown.
     ids[ids == len(table.classes)] = UNKNOWN
     given = np.array(original_ids)[table.objects]
-    notes = [*table.notes, *pixels.notes]
+    notes = [*table.notes, *of_lenses]
     if unlisted:
         notes.append(f"{unlisted} masks have no class in their frame's table: void")
     frame_masks = FrameMasks(ids, table.classes[:-1].astype(np.int64))
     tracks = associate(frame_masks, world_to_camera, intrinsics, given)
     count = len(tracks.object_class)
     notes.append(f"{count} objects are found from {len(given)} masks (--tracks auto)")
-    found = np.where(tracks.ids < 0, count + 1, tracks.ids).astype(np.uint32)
-    classes = np.array([*tracks.object_class, VOID])
-    return ReadMasks(found, classes, table.stuff(numbers), intrinsics, notes)
+    return {
+        "ids": np.where(tracks.ids < 0, count + 1, tracks.ids).astype(np.uint32),
+        "object_class": np.array([*tracks.object_class, VOID]),
+        "stuff": thinned_stuff(table.stuff(numbers)),
+        "intrinsics": intrinsics,
+        "notes": tuple(notes),
+    }
 
 
-class _Pixels:
-    """Reads the values of masks, all of one size, undistorted and downsampled.
-
-    `size` is the (height, width) of all masks, and `stored` that of the downsampled images.
-    """
-
-    def __init__(self, masks: MaskFormat, size: tuple[int, int], stored: tuple[int, int]):
-        self._masks, self._size, self._stored = masks, size, stored
-        self._views: dict[tuple[Lens, bytes], Straightened] = {}
-
-    @property
-    def notes(self) -> list[str]:
-        """Notes on the lenses straightened so far."""
-        notes = []
-        for lens in dict.fromkeys(lens for lens, _ in self._views):
-            cut = max(view.cut_share for (other, _), view in self._views.items() if other == lens)
-            notes.append(f"the lens {lens} is undistorted; {cut:.0%} of its pictures is cut away")
-        return notes
-
-    def read(self, frame: PosedFrame) -> tuple[np.ndarray, np.ndarray]:
-        """Read a frame's values, int32 with -1 where unknown, and their intrinsics."""
-        values = self._values(frame)
-        K, picture = frame_intrinsics(frame, self._size)
-        K = mask_intrinsics(K, picture, self._size, self._size)
-        if not (lens := frame.camera.lens).is_straight:
-            key = lens, K.tobytes()
-            if key not in self._views:
-                try:
-                    self._views[key] = straighten(lens, K, self._size)
-                except InputError as error:
-                    raise InputError(f"frame {shown(frame.name)}: {error}") from None
-            view = self._views[key]
-            K, values = view.intrinsics, values[view.rows, view.columns]
-        lines = [sampled_lines(*sides) for sides in zip(self._size, self._stored, strict=True)]
-        return values[np.ix_(*lines)], mask_intrinsics(K, self._size, self._size, self._stored)
-
-    def _values(self, frame: PosedFrame) -> np.ndarray:
-        mask, size = self._masks.of(frame), self._size
+def _pixels(
+    masks: MaskFormat,
+    frames: list[PosedFrame],
+    size: tuple[int, int],
+    stored: tuple[int, int],
+    notes: list[str],
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Values of each frame's masks, int32 with -1 where unknown, and their intrinsics, undistorted
+    and downsampled. `size` is the (height, width) of all masks, and `stored` that of the
+    downsampled images; `notes` takes sentences on the lenses."""
+    views: dict[tuple[Lens, bytes], Straightened] = {}
+    lines = np.ix_(*(sampled_lines(*sides) for sides in zip(size, stored, strict=True)))
+    for frame in frames:
+        mask = masks.of(frame)
         if mask is None:
-            raise InputError(f"{self._masks.wanted(frame)} is missing")
-        ids = mask.read().astype(np.int32)
-        if ids.shape != size:
+            raise InputError(f"{masks.wanted(frame)} is missing")
+        values = mask.read().astype(np.int32)
+        if values.shape != size:
             raise InputError(
-                f"the mask of frame {shown(frame.name)} is {ids.shape[1]} x {ids.shape[0]} pixels, "
-                f"but the first frame's {size[1]} x {size[0]}; a room has one size"
+                f"the mask of frame {shown(frame.name)} is {values.shape[1]} x {values.shape[0]} "
+                f"pixels, but the first frame's {size[1]} x {size[0]}; a room has one size"
             )
         if frame.known is not None:
             known = read_mask(frame.known)
@@ -321,5 +286,18 @@ class _Pixels:
                     f"{frame.known} is {known.shape[1]} x {known.shape[0]} pixels, but the ids "
                     f"{size[1]} x {size[0]}"
                 )
-            ids[known == 0] = -1
-        return ids
+            values[known == 0] = -1
+        K, picture = frame_intrinsics(frame, size)
+        K = mask_intrinsics(K, picture, size, size)
+        if not (lens := frame.camera.lens).is_straight:
+            key = lens, K.tobytes()
+            try:
+                view = views[key] if key in views else straighten(lens, K, size)
+            except InputError as error:
+                raise InputError(f"frame {shown(frame.name)}: {error}") from None
+            views[key] = view
+            K, values = view.intrinsics, values[view.rows, view.columns]
+        yield values[lines], mask_intrinsics(K, size, size, stored)
+    for lens in dict.fromkeys(lens for lens, _ in views):
+        cut = max(view.cut_share for (other, _), view in views.items() if other == lens)
+        notes.append(f"the lens {lens} is undistorted; {cut:.0%} of its pictures is cut away")

@@ -36,7 +36,6 @@ from data_prep.readers.reader import FoundRoom, Reader
 from data_prep.readers.rooms import FramedRoom
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.observations import thinned_stuff
 
 TRACKS = ("given", "auto")
 
@@ -151,13 +150,9 @@ class Posed(Reader):
         except InputError as error:
             raise InputError(f"{recording.path}: {str(error).removesuffix('.')}.") from None
         return FramedRoom(
+            **made | {"notes": (*notes, *made["notes"])},
             where=str(recording.path),
-            ids=made.ids,
-            object_class=made.object_class,
             camera_to_world=upright,
-            intrinsics=made.intrinsics,
-            stuff=thinned_stuff(made.stuff),
-            notes=(*notes, *made.notes),
             may_err=True,
             world_from_file=turn,
             poses_file=recording.path.relative_to(recording.folder).as_posix(),
