@@ -8,21 +8,8 @@ import pytest
 from toy_rooms import write_shard
 
 from sceneprior.core.errors import ShardError
-from sceneprior.core.ground_truth import independent_rooms, reference_scenes, shuffled_rooms
-from sceneprior.core.scene import Mesh, Scene, SceneObject
-from sceneprior.evaluation.metrics.contents import class_counts
+from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.render.topdown import topdown
-
-MESH = Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
-
-
-def bedroom(name: str, others: int) -> Scene:
-    bed = SceneObject("double_bed", (0.0, 0.3, 0.0), (2.0, 0.6, 2.0), MESH)
-    stand = SceneObject("nightstand", (1.3, 0.2, float(others)), (0.4, 0.4, 0.4))
-    return Scene(name, "front3d_bedroom", (bed,) + (stand,) * others)
-
-
-REAL = [bedroom("a", 1), bedroom("b", 3)]
 
 
 def test_a_room_holds_its_named_objects_seen_or_not_and_no_void(shards):
@@ -75,37 +62,3 @@ def test_shards_without_ground_truth_say_so(tmp_path, toy_room):
     write_shard(tmp_path / "test" / "a.h5", "front3d_bedroom", [(views, None)])
     with pytest.raises(ShardError, match="carries no 3D ground truth"):
         reference_scenes(tmp_path, "test")
-
-
-def test_marginals_stay_and_bonds_go():
-    rooms = independent_rooms(REAL, 4000, 0)
-    assert {len(room.objects) for room in rooms} == {2, 4}
-    assert np.mean([len(room.objects) for room in rooms]) == pytest.approx(3, abs=0.05)
-    shares = [class_counts(group).sum(0) / class_counts(group).sum() for group in (rooms, REAL)]
-    assert shares[0] == pytest.approx(shares[1], abs=0.01)
-    # Every real room has one bed; of two draws at a third each, 4 in 9 rooms have none.
-    pairs = [room for room in rooms if len(room.objects) == 2]
-    without = np.mean([all(o.label != "double_bed" for o in room.objects) for room in pairs])
-    assert without == pytest.approx(4 / 9, abs=0.04)
-
-
-def test_shuffled_rooms_keep_what_a_room_holds_and_take_places_from_all_rooms(rng):
-    real = [
-        replace(room, objects=tuple(
-            replace(item, center_m=(float(rng.uniform()), item.center_m[1], float(rng.uniform())))
-            for item in room.objects
-        ))
-        for room in (bedroom(f"{row}", row) for row in range(6))
-    ]  # fmt: skip
-    shuffled = shuffled_rooms(real, 6, 0)
-
-    def contents(scene: Scene) -> list:
-        return sorted((item.label, item.size_m, item.center_m[1]) for item in scene.objects)
-
-    assert sorted(map(contents, shuffled)) == sorted(map(contents, real))
-    places = {(item.center_m[0], item.center_m[2]) for room in real for item in room.objects}
-    found = [(item.center_m[0], item.center_m[2]) for room in shuffled for item in room.objects]
-    assert set(found) <= places and len(set(found)) > 5
-    assert all(item.mesh is None for room in shuffled for item in room.objects)
-    assert shuffled == shuffled_rooms(real, 6, 0) != shuffled_rooms(real, 6, 1)
-    assert len(shuffled_rooms(real, 2, 0)) == 2

@@ -18,8 +18,6 @@ import sceneprior.evaluation
 from sceneprior.core.scene import Mesh, Opening, Scene, SceneObject
 from sceneprior.core.surfaces import surface_of
 from sceneprior.evaluation.page import (
-    FACES_PER_PAGE,
-    faces_per_object,
     glb_of,
     write_rooms_page,
 )
@@ -118,16 +116,6 @@ def test_pictures_stay_where_something_is_missing(browser, page, missing):
             browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": False})
         else:
             browser.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", script)
-
-
-def test_rooms_share_the_faces_of_a_page():
-    rooms = [bedroom()] * 20
-    assert faces_per_object(rooms) == FACES_PER_PAGE // 40
-    assert faces_per_object([]) == FACES_PER_PAGE
-    whole, light = glb_of(bedroom(), 5000), glb_of(bedroom(), 300)
-    faces = len(bedroom().objects[1].mesh.faces)
-    # A closed mesh has half as many vertices as faces: 12 bytes a face, and 12 for each half.
-    assert len(whole) - len(light) == pytest.approx((faces - 300) * 18, rel=0.05)
 
 
 def test_walls_of_a_model_are_seen_from_inside_only():

@@ -1,6 +1,5 @@
 """The whole evaluation on toy rooms: keys, protocol, fairness, refusals."""
 
-import io
 import json
 import shutil
 from dataclasses import replace
@@ -24,26 +23,6 @@ def generated(shards) -> list[Scene]:
 @pytest.fixture
 def no_classifier(monkeypatch):
     without_classifiers(monkeypatch)
-
-
-@pytest.mark.usefixtures("no_classifier")
-def test_the_printed_table_holds_a_column_a_set(generated, shards):
-    scores = evaluate_synthesis(generated, shards, EvalOptions(seed=1))
-    page = Console(file=io.StringIO(), width=140)
-    print_scores(scores, page)
-    text = page.file.getvalue()
-    assert "3 rooms" in text and "5 rooms" in text and "not FID" in text
-    assert "nan" not in text.lower()
-    told = " ".join(text.split())
-    assert "Not measured without --boxes: fd_effnet_lite0_boxes, gap_closed_boxes." in told
-    assert "without decoded training rooms: nearest_decoded_m." in told
-    rows = {row[0]: row[2:] for row in score_rows(scores)}
-    assert rows["Objects in a room"] == ("2.000", "3.000", "3.000", "3.000", "3.000")
-    assert rows["Pieces out of the floor's bounds"] == ("0.000",) * 5
-    value, interval = rows["Frechet distance, EfficientNet-Lite0 (not FID)"][0].split("\n")
-    low, high = map(float, interval.split(" to "))
-    assert low <= float(value) <= high
-    assert "FID (Inception)" not in rows
 
 
 def test_odd_sets_of_rooms_have_metrics_or_none_but_never_nan(shards, no_classifier):
@@ -87,4 +66,7 @@ def test_mostly_empty_rooms_are_told_and_have_no_precision(generated, shards):
     assert scores["train_rooms"]["precision_effnet_lite0"] is not None
     console = Console(record=True, width=150)
     print_scores(scores, console)
-    assert "2 of 3 generated rooms are empty" in console.export_text()
+    told = " ".join(console.export_text().split())
+    assert "2 of 3 generated rooms are empty" in told and "nan" not in told.lower()
+    assert "Not measured without --boxes: fd_effnet_lite0_boxes, gap_closed_boxes." in told
+    assert "without decoded training rooms: nearest_decoded_m." in told

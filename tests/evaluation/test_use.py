@@ -10,7 +10,7 @@ from sceneprior.apps.api import load
 from sceneprior.core.contact_resolution import make_stable
 from sceneprior.core.scene import Mesh, Opening, Scene, SceneObject, Solid, Turned
 from sceneprior.evaluation.geometry import edge_hits, inside, meeting_pairs
-from sceneprior.evaluation.metrics.physics import PITCH_M, settle, stable_count, voxelize
+from sceneprior.evaluation.metrics.physics import settle, stable_count
 from sceneprior.evaluation.metrics.placement import colliding, containing
 from sceneprior.evaluation.metrics.support import supported
 from sceneprior.evaluation.use import UseOptions, measure_room, measure_use
@@ -153,18 +153,13 @@ def test_values_by_hand(key, scene, expected, near):
     assert found == (expected if expected is None else pytest.approx(expected, abs=near, rel=1e-12))
 
 
-def test_rooms_without_floor_or_doors_say_what_is_missing():
-    bare = room(box(), floor=None)
-    sets = {"generated": [bare], "test": [room(box())]}
+def test_what_no_generated_room_has_is_left_out_of_all_sets():
+    sets = {"generated": [room(box(), floor=None)], "test": [room(box())]}
     columns, left_out = measure_use(sets, 0, 0, UseOptions("none"))
     assert left_out["sceneeval_oob_objects"] == "a floor (floor_m) in the scenes"
     assert left_out["sceneeval_clear_openings"] == "doors or windows (openings) in the scenes"
     assert left_out["stable_share"] == "--settle solids"
-    for column in columns.values():
-        assert set(column) == {
-            "sceneeval_col_objects", "sceneeval_col_scenes", "physcene_col_objects",
-            "physcene_col_scenes", "sceneeval_supported",
-        }  # fmt: skip
+    assert all(len(column) == 5 and not set(column) & set(left_out) for column in columns.values())
     _, left_out = measure_use({"generated": [room(floor=None)]}, 0, 0, UseOptions("none"))
     assert left_out["sceneeval_supported"] == "objects in the scenes"
 
@@ -192,20 +187,6 @@ def test_triangles_meet_where_an_edge_passes_through(rng):
     assert len(by_hand) > 50 and {tuple(pair) for pair in pairs.tolist()} == by_hand
     hits = edge_hits(a[pairs[:, 0]], b[pairs[:, 1]])
     assert len(hits) == 2 * len(pairs)  # a segment has two ends
-
-
-def test_voxels_are_those_of_trimesh():
-    for mesh in (
-        trimesh.creation.icosphere(subdivisions=2, radius=0.43),
-        trimesh.creation.box((0.61, 0.37, 1.03)),
-        trimesh.creation.cylinder(radius=0.21, height=0.83),
-    ):
-        theirs = mesh.voxelized(PITCH_M).fill()
-        ours = voxelize(np.asarray(mesh.triangles)) - np.round(theirs.translation / PITCH_M)
-        cells = np.zeros_like(theirs.matrix)
-        cells[tuple(ours.astype(int).T)] = True
-        # Points of the two divisions differ, so cells that a surface cuts at a corner may.
-        assert (cells != theirs.matrix).mean() < 0.02
 
 
 pytest.importorskip("mujoco", reason="no mujoco here: pip install -e '.[sim]'")

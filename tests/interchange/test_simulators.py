@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -28,35 +27,6 @@ def scene() -> Scene:
         solid_box("pendant_lamp", (1.0, 2.2, -0.5), (0.3, 0.4, 0.2)),
     )
     return Scene("room", BEDROOM, objects, L, openings=(DOOR,))
-
-
-def numbers(element: ElementTree.Element, name: str) -> list[float]:
-    return [float(number) for number in element.get(name).split()]
-
-
-def test_mujoco_gets_primitives_that_stand(tmp_path):
-    """A box, a round cylinder and a dome; the oval cylinder is a mesh."""
-    solids = (
-        Solid("box", (-0.5, 0.7, -0.5), (0.5, 0.8, 0.5)),
-        Solid("cylinder", (-0.5, 0.1, -0.5), (-0.4, 0.7, -0.4)),
-        Solid("cylinder", (0.3, 0.1, -0.5), (0.5, 0.7, 0.5)),
-        Solid("dome", (-0.2, 0.8, -0.2), (0.2, 1.0, 0.2)),
-    )
-    table = SceneObject("table", (0.0, 0.55, 0.0), (1.0, 0.9, 1.0), solids=solids)
-    lamp = SceneObject("pendant_lamp", (1.0, 2.2, -0.5), (0.3, 0.4, 0.2))
-    (note,) = export_scenes([Scene("one", BEDROOM, (table, lamp))], "mujoco", tmp_path)
-    assert note.endswith("overlaps: 1 set down (of 2 objects).")
-    root = ElementTree.parse(tmp_path / "one.xml").getroot()
-    first, second = root.findall(".//body")
-    assert (first.get("name"), second.get("name")) == ("0_table", "1_pendant_lamp")
-    assert first.find("freejoint") is not None and second.find("freejoint") is None
-    geoms = first.findall("geom")
-    assert [geom.get("type") for geom in geoms] == ["box", "cylinder", "mesh", "mesh"]
-    np.testing.assert_allclose(numbers(first, "pos"), (0, 0, 0.45))
-    np.testing.assert_allclose(numbers(geoms[1], "size"), (0.05, 0.3))
-    np.testing.assert_allclose(numbers(geoms[1], "pos"), (-0.45, 0.45, -0.15))
-    total = sum(float(geom.get("mass")) for geom in geoms)
-    assert total == pytest.approx(mass_kg(table), rel=1e-3)
 
 
 def test_mujoco_loads_a_room_with_walls_in_which_nothing_overlaps(scene, tmp_path):
