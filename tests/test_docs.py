@@ -69,28 +69,19 @@ def check_sceneprior(words: list[str], folder: Path) -> None:
             load_config(source, values_of("--set", words))
 
 
-def check_script(words: list[str]) -> None:
-    """The script exists and knows every option."""
-    script = ROOT / words[1]
-    assert script.is_file(), f"no script {words[1]}"
-    source = script.read_text()
-    for option in (word for word in words[2:] if word.startswith("-")):
-        assert f'"{option}"' in source, f"{words[1]} has no option {option}"
-
-
-def check_make(words: list[str]) -> None:
-    assert re.search(rf"^{words[1]}:", (ROOT / "Makefile").read_text(), re.MULTILINE), words
-
-
 def check_shell(block: Block, folder: Path) -> None:
+    """Commands, scripts and their options, and targets of the Makefile exist."""
     for words in commands_of(block.text):
         match words[0]:
             case "sceneprior":
                 check_sceneprior(words, folder)
             case "python":
-                check_script(words)
+                source = (ROOT / words[1]).read_text()
+                for option in (word for word in words[2:] if word.startswith("-")):
+                    assert f'"{option}"' in source, f"{words[1]} has no option {option}"
             case "make":
-                check_make(words)
+                makefile = (ROOT / "Makefile").read_text()
+                assert re.search(rf"^{words[1]}:", makefile, re.MULTILINE), words
             case "export":
                 assert all("=" in word for word in words[1:]), words
             case _:
@@ -141,16 +132,11 @@ def check_drawing(block: Block, folder: Path) -> None:
     assert name_of(block.page) == "docs/architecture.md"
 
 
-def check_unnamed(block: Block, folder: Path) -> None:
-    """A block without a language holds commands."""
-    assert block.text.startswith("sceneprior "), "a block needs a language"
-    check_shell(block, folder)
-
-
 CHECKS = {
-    "": check_unnamed, "bash": check_shell, "sh": check_shell, "python": check_python,
+    "": check_shell, "bash": check_shell, "sh": check_shell, "python": check_python,
     "json": check_json, "yaml": check_yaml, "text": check_drawing,
 }  # fmt: skip
+"""The check of a block, by its language; a block without a language holds commands."""
 
 
 @pytest.mark.parametrize("block", BLOCKS, ids=block_id)
@@ -336,16 +322,6 @@ def anchors_of(page: Path) -> set[str]:
     """Anchors of a page's headings, as GitHub makes them."""
     headings = re.findall(r"^#+ (.*)$", page.read_text(), re.MULTILINE)
     return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
-
-
-def test_every_experiment_is_in_the_index():
-    folder = ROOT / "docs" / "experiments"
-    index = (folder / "README.md").read_text()
-    for page in folder.glob("*.md"):
-        if page.name != "README.md":
-            assert f"]({page.name})" in index
-            day = re.match(r"\d{4}-\d\d-\d\d", page.name)
-            assert day and page.read_text().startswith(f"# {day[0]}: ")
 
 
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "CHANGELOG.md"], ids=name_of)

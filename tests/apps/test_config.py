@@ -85,24 +85,6 @@ def test_no_shipped_config_is_a_variant_an_ablation_or_draws_near_copies(path):
     assert not (decoder.final_norm or decoder.query_self_attention or decoder.step_mlps)
 
 
-def test_the_released_codes_settings_are_one_command_away():
-    """The keys that docs/paper_map.md lists, as it lists them."""
-    text = (FOLDER.parent / "docs" / "paper_map.md").read_text()
-    _, command = text.split("```bash\n", 1)
-    words = command.split("```", 1)[0].replace("\\\n", " ").split()
-    assert words[:4] == ["sceneprior", "fit", "--config", "paper/bedroom.yaml"]
-    config = load_config(words[3], tuple(words[i + 1] for i, w in enumerate(words) if w == "--set"))
-    model = config.model
-    decoder = model.decoder
-    assert (decoder.hidden, model.layout_heads, model.completeness_target) == (
-        512, "separate", "stop",
-    )  # fmt: skip
-    assert decoder.final_norm and decoder.query_self_attention and decoder.step_mlps
-    assert (config.layout.batch_size, config.layout.schedule.milestones) == (128, (400,))
-    assert (config.shape.batch_size, config.shape.schedule.milestones) == (16, (300,))
-    assert config.sampling.distribution == "paper"
-
-
 def test_a_former_section_that_asks_for_nothing_is_dropped(config):
     for former in ("{every: 0, count: 200, seed: 0, metric: category_kl}", "{count: 5}", "{}"):
         assert load_config(str(config), (f"samples={former}",)) == load_config(str(config))
@@ -136,7 +118,6 @@ def test_set_overrides_what_the_file_says(config):
 
 # -- Refusals --------------------------------------------------------------------------------------
 
-LONG = "ab" * 9000
 CHANGES = {
     "no_method": ("method: paper", "stages: two"),
     "key_of_model": ("  width: 16", "  widht: 16"),
@@ -151,10 +132,7 @@ CHANGES = {
     "class_twice": ("label_set: front3d_bedroom", "label_set: 'void,bed,bed'"),
     "no_section": ("loss: {}", "loss: 3"),
     "two_mistakes": ("  width: 16", "  widht: 16\n  heigth: 3"),
-    "long_list": ("seed: 3", f"seed: [{LONG}]"),
     "long_key": ("seed: 3", f"{'ab' * 500}: 3"),
-    "long_label_set": ("label_set: front3d_bedroom", f"label_set: {LONG}"),
-    "long_method": ("method: paper", f"method: {LONG}"),
 }
 OVERRIDES = {
     "samples": "samples={every: 25}",
@@ -183,15 +161,13 @@ def test_a_mistake_in_the_file_is_a_sentence(config, tmp_path, name):
         load_config(str(config))
 
 
-@pytest.mark.parametrize("name", OVERRIDES)
+@pytest.mark.parametrize("name", [*OVERRIDES, "of_paper"])
 def test_a_mistake_in_an_override_is_a_sentence(config, tmp_path, name):
-    with refused(f"apps/override_{name}", ConfigError, tmp=tmp_path):
-        load_config(str(config), (OVERRIDES[name],))
-
-
-def test_keys_of_the_paper_are_refused_by_the_lifted_method():
-    with refused("apps/override_of_paper", ConfigError, configs=FOLDER):
-        load_config("demo.yaml", ("loss.occlusion_slack=1",))
+    where, override = str(config), OVERRIDES.get(name)
+    if override is None:
+        where, override = "demo.yaml", "loss.occlusion_slack=1"
+    with refused(f"apps/override_{name}", ConfigError, tmp=tmp_path, configs=FOLDER):
+        load_config(where, (override,))
 
 
 def test_no_such_config_lists_the_shipped_ones(tmp_path, monkeypatch):
@@ -206,13 +182,10 @@ def test_no_such_config_lists_the_shipped_ones(tmp_path, monkeypatch):
 
 
 NO_CONFIGS = {
-    "empty": b"",
     "list": b"- a\n",
     "open": b"a: [1,\n",
-    "tab": b"\tx: 1\n",
     "bytes": b"\xff\xfe\x00",
     "date": b"x: 2001-99-99",
-    "digits": b"seed: " + b"9" * 5000,
     "size": b"#" * 2**20 + b"\nx: 1",
 }
 

@@ -9,7 +9,6 @@ import pytest
 from sceneprior.apps.experiments import commands
 from sceneprior.apps.experiments.commands import demo_commands, finished_commands, run_demo
 from sceneprior.core.errors import InputError
-from sceneprior.core.settings import find_config
 
 SETTINGS = ("demo.yaml", 20, 4)
 COMMANDS = ["make-homes", "prep-front", "fit", "synthesize", "eval-fid", "report"]
@@ -95,14 +94,3 @@ def test_costs_add_up_over_a_stop_and_are_unknown_after_a_kill(ran, tmp_path):
     run(tmp_path, called)
     scores = json.loads((tmp_path / "scores.json").read_text())
     assert wall_s() == 6.0 and scores["seconds"] == 16.0
-
-
-def test_other_settings_in_the_same_file_are_trained_anew(ran, tmp_path):
-    called, _ = ran
-    config = tmp_path / "mine.yaml"
-    config.write_text(find_config("demo.yaml").read_text())
-    settings = (str(config), *SETTINGS[1:])
-    run(tmp_path, called, settings=settings)
-    assert run(tmp_path, called, settings=settings) == []
-    config.write_text(config.read_text().replace("seed: 0", "seed: 1"))
-    assert run(tmp_path, called, settings=settings) == COMMANDS[2:]

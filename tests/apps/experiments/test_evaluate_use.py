@@ -1,34 +1,23 @@
-"""`evaluate` from the command line: scenes without shards, a run with them, requests, refusals."""
+"""`evaluate` from the command line: scenes without shards, a run with them."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from sceneprior.apps.config import load_run
-from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.scene import Scene, SceneObject
-from sceneprior.core.scene_json import scene_to_json
+from sceneprior.render.scene_files import save
 
 FLOOR = np.array([[-2.0, -2], [2, -2], [2, 2], [-2, 2]])
 
 
-def write_scene(scene, path):
-    path.write_text(json.dumps(scene_to_json(scene)))
-
-
-def write_rooms(folder, **more):
+def test_scenes_alone_are_measured_without_shards(command, tmp_path):
     """Two rooms: a desk alone, and two desks that share half of their volume."""
-    folder.mkdir()
     desks = [SceneObject("desk", (x, 0.4, 0.0), (1.0, 0.8, 1.0)) for x in (-0.25, 0.25)]
     for name, objects in (("one", desks[:1]), ("two", desks)):
-        write_scene(Scene(name, "front3d_bedroom", tuple(objects), **more), folder / f"{name}.json")
-
-
-def test_scenes_alone_are_measured_without_shards(command, tmp_path):
-    write_rooms(tmp_path / "made", floor_m=FLOOR)
+        room = Scene(name, "front3d_bedroom", tuple(objects), floor_m=FLOOR)
+        save(room, tmp_path / "made" / f"{name}.json")
     status, printed, errors = command("evaluate", "--scenes", "made", "--settle", "none")
     assert status == 0, errors
     assert "Rooms for use" in printed and "COL: objects that collide (SceneEval)" in printed
@@ -43,42 +32,18 @@ def test_scenes_alone_are_measured_without_shards(command, tmp_path):
     assert scores["protocol"]["left_out"]["stable_share"] == "--settle solids"
 
 
-def test_rooms_without_a_floor_are_told(command, tmp_path):
-    write_rooms(tmp_path / "made")
-    status, printed, errors = command("evaluate", "--scenes", "made", "--settle", "none")
-    assert status == 0, errors
-    assert "a floor (floor_m)" in printed and "NAV: navigable" not in printed
-    write_rooms(tmp_path / "mixed", floor_m=FLOOR)
-    bare = Scene("three", "front3d_bedroom")
-    write_scene(bare, tmp_path / "mixed" / "three.json")
-    status, printed, errors = command("evaluate", "--scenes", "mixed", "--settle", "none")
-    assert status == 0 and "1 of 3 generated rooms have no floor" in printed, errors
-
-
 def test_a_run_stands_beside_real_and_random_rooms(command, toy_run, toy_shards, tmp_path):
     call = ["evaluate", "--run", toy_run, "-n", 4, "--only-use", "--out", "use.json"]
     status, printed, errors = command(*call, "--settle", "none", "--resamples", 5)
     assert status == 0, errors
     scores = json.loads((tmp_path / "use.json").read_text())
-    made, real = sample_rooms(load_run(toy_run), 4, 0), reference_scenes(toy_shards, "test")
+    real = reference_scenes(toy_shards, "test")
     assert scores["protocol"]["n_generated"] == 4 and scores["protocol"]["n_test"] == len(real)
     assert all("sceneeval_supported" in scores[name] for name in ("shuffled", "independent"))
     assert "sceneeval_supported_test" in scores and "shuffled" in printed
-    # The same, of the same rooms in files.
-    (tmp_path / "made").mkdir()
-    for scene in made:
-        write_scene(
-            replace(scene, latent=None).without_meshes(), tmp_path / f"made/{scene.name}.json"
-        )
-    folder = ["evaluate", "--scenes", "made", "--shards", toy_shards, "--only-use"]
-    assert command(*folder, "--settle", "none", "--out", "again.json")[0] == 0
-    again = json.loads((tmp_path / "again.json").read_text())
-    assert again["shuffled"] == scores["shuffled"]
     # Decoded rooms have no floor, so what needs one is left out of the real rooms' column, too.
-    assert (
-        "physcene_reach_test" not in scores and "physcene_reach" in scores["protocol"]["left_out"]
-    )
-    assert again["sceneeval_supported_test"] == scores["sceneeval_supported_test"]
+    assert "physcene_reach_test" not in scores
+    assert "physcene_reach" in scores["protocol"]["left_out"]
 
 
 def test_a_run_has_all_scores_at_once_and_a_page_of_them(command, toy_run, tmp_path):

@@ -14,7 +14,7 @@ from sceneprior.apps.experiments.comparison import (
     shards_of,
     variants_of,
 )
-from sceneprior.apps.experiments.table import VIEWS, Row, markdown, write_tables
+from sceneprior.apps.experiments.table import write_tables
 
 GOLDEN = Path(__file__).parents[2] / "golden" / "apps"
 
@@ -105,17 +105,3 @@ def test_tables_of_single_views(tmp_path):
             write_views(variant.result, number + k, run.method == "usl")
     write_tables(comparison, runs, tmp_path)
     assert_tables("views", tmp_path)
-
-
-def test_surfaces_that_are_unknown_are_counted():
-    scores = {
-        "rooms": 3, "images": 3, "objects": 9, "with_surface": 4, "box_iou_3d": 0.5,
-        "seconds": 0.25, "nearest_room": {"box_iou_3d": 0.2}, "random_room": {},
-        "protocol": {"shards": "data/rooms", "known_model_share": None},
-    }  # fmt: skip
-    found = markdown([Row("Rooms", 0, "A", "baselines", "as found", scores, "2D", 0)], VIEWS)
-    assert (
-        "of the lifted method: none; of baselines: 'A'. 3 views of 3 test rooms of rooms" in found
-    )
-    assert ", 9 objects (4 of them with a known surface); masks," in found
-    assert "| A | as found | 0.500 | 0.250 |" in found

@@ -7,7 +7,7 @@ from model_folder import blocks, corner_sofa, write_model, write_models
 from refusals import refused
 
 from sceneprior.apps.retrieval import cad_models
-from sceneprior.apps.retrieval.cad_models import POINTS, class_of_folder, open_models, read_glb
+from sceneprior.apps.retrieval.cad_models import POINTS, open_models, read_glb
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputWarning
 
@@ -127,18 +127,6 @@ def test_own_folders_are_classes_or_categories(own, recwarn):
     np.testing.assert_allclose(np.ptp(models.load("sofa/plain.GLB").vertices_m, axis=0), 1)
     mesh = read_glb(own / "sofa" / "plain.GLB")
     assert mesh.vertices_m[:, 1].max() == pytest.approx(0.8)  # nodes are placed
-
-
-@pytest.mark.parametrize(
-    ("name", "label"),
-    [
-        ("tv_stand", "tv_stand"), ("TV Stand", "tv_stand"), ("barstool", "void"),
-        ("bookcase_jewelry armoire", "bookshelf"), ("toilet", "void"), ("spaceship", None),
-    ],
-)  # fmt: skip
-def test_names_of_folders(name, label):
-    assert class_of_folder(name, "front3d_bedroom") == label
-    assert class_of_folder("spaceship", "void,spaceship") == "spaceship"
 
 
 def test_unknown_names_and_damaged_files_are_a_sentence_each(own):

@@ -158,9 +158,3 @@ def test_large_textures_are_scaled_down_and_written_as_png(mode, tmp_path):
     seat = next(part for part in read_textured(path) if part.uv is not None)
     found = seat.material.baseColorTexture
     assert found.size == (LARGEST_PX, LARGEST_PX // 2) and found.mode in ("L", "RGB", "RGBA")
-
-
-def test_texture_coordinates_that_are_no_numbers_leave_the_colour(tmp_path):
-    path = write_sofa(tmp_path / "sofa" / "a.obj")
-    path.write_text(path.read_text().replace("vt 0.0 0.0", "vt nan nan"))
-    assert [part.uv for part in read_textured(path)] == [None, None]
