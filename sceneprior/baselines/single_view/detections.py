@@ -10,6 +10,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -163,15 +164,8 @@ class Detections:
 
 def some_views(views: SceneViews, part: slice) -> SceneViews:
     """The batch, reduced to the views `part` of each room."""
-    return replace(
-        views,
-        world_to_camera=views.world_to_camera[:, part],
-        intrinsics=views.intrinsics[:, part],
-        boxes=views.boxes[:, part],
-        visible=views.visible[:, part],
-        sides_clear=views.sides_clear[:, part],
-        instance_ids=views.observed_ids[:, part],
-    )
+    names = ("world_to_camera", "intrinsics", "boxes", "visible", "sides_clear", "instance_ids")
+    return replace(views, **{name: getattr(views, name)[:, part] for name in names})
 
 
 def detections_of(views: SceneViews) -> Detections:
@@ -280,8 +274,8 @@ class ViewNetwork(nn.Module, ABC):
         placed, meshes = self.reconstruct(found)
         answers: list[list[FoundObject]] = [[] for _ in views.room_index]
         numbers = (part.tolist() for part in (found.room, placed.centers_m, placed.sizes_m))
-        for room, (x, y, z), (width, height, depth), mesh in zip(*numbers, meshes, strict=True):
-            answers[room].append(FoundObject((x, y, z), (width, height, depth), mesh))
+        for room, center_m, size_m, mesh in zip(*numbers, meshes, strict=True):
+            answers[room].append(FoundObject(tuple(center_m), tuple(size_m), mesh))
         return answers
 
 
@@ -294,11 +288,9 @@ class DetectionEncoder(nn.Module):
         super().__init__()
         self.classes = classes
         sides = (CHANNELS, width // 4, width // 2, width)
-        convolutions = [
-            part
-            for i in range(3)
-            for part in (nn.Conv2d(sides[i], sides[i + 1], 3, stride=2, padding=1), nn.ReLU())
-        ]
+        convolutions: list[nn.Module] = []
+        for inputs, outputs in pairwise(sides):
+            convolutions += [nn.Conv2d(inputs, outputs, 3, stride=2, padding=1), nn.ReLU()]
         self.crop = nn.Sequential(
             *convolutions, nn.Flatten(), nn.Linear(width * (CROP // 8) ** 2, width)
         )
@@ -310,14 +302,6 @@ class DetectionEncoder(nn.Module):
         numbers, known = found.numbers, F.one_hot(found.object_class, self.classes)
         numbers = self.numbers(torch.cat([numbers, known.to(numbers)], dim=-1))
         return F.relu(self.join(torch.cat([self.crop(found.crops), numbers], dim=-1).relu()))
-
-
-def meshes_of(
-    vertices_m: Float[Tensor, "masks vertices 3"], faces: Int[Tensor, "faces 3"]
-) -> list[Mesh]:
-    """One mesh per mask; all have the same faces."""
-    triangles = faces.cpu().numpy()
-    return [Mesh(as_numpy(vertices), triangles) for vertices in vertices_m]
 
 
 def last_layer(width: int, outputs: int) -> nn.Linear:

@@ -16,8 +16,8 @@ from sceneprior.baselines.single_view.detections import (
     Detections,
     Placed,
     ViewNetwork,
+    as_numpy,
     detections_of,
-    meshes_of,
 )
 from sceneprior.baselines.single_view.detector import (
     Detector,
@@ -76,8 +76,9 @@ class Total3d(ViewNetwork):
 
     def reconstruct(self, found: Detections) -> tuple[Placed, list[Mesh]]:
         estimate, vertices = self(found)
-        placed = estimate.boxes().in_room(found)
-        return placed, meshes_of(placed.points_m(found, vertices), self.shape.faces)
+        placed, faces = estimate.boxes().in_room(found), self.shape.faces.cpu().numpy()
+        vertices_m = as_numpy(placed.points_m(found, vertices))
+        return placed, [Mesh(each, faces) for each in vertices_m]
 
 
 class Total3dStage(OneStage):

@@ -20,9 +20,9 @@ from sceneprior.baselines.single_view.detections import (
     SingleViewModel,
     SingleViewTraining,
     ViewNetwork,
+    as_numpy,
     detections_of,
     last_layer,
-    meshes_of,
     some_views,
 )
 from sceneprior.core.cameras import boxes_of_points
@@ -99,7 +99,8 @@ class Usl(ViewNetwork):
 
     def reconstruct(self, found: Detections) -> tuple[Placed, list[Mesh]]:
         placed, vertices_m = self(found)
-        return placed, meshes_of(vertices_m, self.shape.faces)
+        faces = self.shape.faces.cpu().numpy()
+        return placed, [Mesh(vertices, faces) for vertices in as_numpy(vertices_m)]
 
 
 class UslStage(OneStage):
