@@ -21,7 +21,7 @@ from sceneprior.core.shell import SHELLS, shell_meshes, shell_of
 from sceneprior.core.wall_lines import find_walls, seen_floor
 from sceneprior.render.scene_files import read_glb_parts, save
 from sceneprior.render.scene_simulators import scene_to_mjcf
-from sceneprior.render.topdown import perspective, topdown
+from sceneprior.render.topdown import floor_plan, perspective, topdown
 
 OUTLINE = np.array([[-2.5, -2], [2.5, -2], [2.5, 0.5], [0.5, 0.5], [0.5, 2.2], [-2.5, 2.2]])
 
@@ -75,6 +75,9 @@ def found(folder: Path) -> dict[str, object]:
         # Whole tens: single pixels at edges may differ.
         means = picture.reshape(9, 40, 12, 40, 3).mean(axis=(1, 3, 4)) / 10
         told[f"{scene.name} picture"] = np.rint(means).tolist()
+        plan = np.pad(floor_plan(scene).astype(int), ((0, 0), (0, 42), (0, 0)), mode="edge")
+        means = plan.reshape(8, 64, 11, 64, 3).mean(axis=(1, 3)) / 10
+        told[f"{scene.name} plan"] = np.rint(means).tolist()
         told[f"{scene.name} mjcf"] = rounded(scene_to_mjcf(scene, shell_of(scene)))
         for shell in SHELLS:
             name = f"{scene.name} {shell}"

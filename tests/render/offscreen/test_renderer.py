@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from refusals import refused
 
+from sceneprior.core.boxes import yaw_rotation
 from sceneprior.core.cameras import Orthographic, Pinhole
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Mesh
@@ -79,12 +80,7 @@ def test_renderers_agree():
     cameras: list[offscreen.Camera] = []
     for angle in np.linspace(0, 6, 7):
         turn = np.eye(4)
-        turn[[0, 0, 2, 2], [0, 2, 0, 2]] = (
-            np.cos(angle),
-            np.sin(angle),
-            -np.sin(angle),
-            np.cos(angle),
-        )
+        turn[:3, :3] = yaw_rotation(angle)
         cameras.append(Pinhole(turn, K))
     cameras.append(Orthographic(np.eye(4), 0.01))
     one = ours.instance_ids_of_views(meshes, cameras, (360, 480))
