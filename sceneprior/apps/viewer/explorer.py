@@ -1,40 +1,152 @@
-"""The viewer's rooms, without a page: those of a trained prior, or of a folder of scenes."""
+"""The viewer's rooms, without a page: those of a trained prior, with a map of its latent space, or
+those of a folder of scenes, and their files for download."""
 
+import io
+import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import MappingProxyType
 from typing import Any
 
-import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from sceneprior.apps.api import Prior
-from sceneprior.apps.viewer.latent_map import LatentMap, make_map
 from sceneprior.core.errors import InputError
-from sceneprior.core.scene import Scene
+from sceneprior.core.scene import Scene, SceneObject
+from sceneprior.core.shell import ShellName
 from sceneprior.evaluation.metrics.contents import common_label_set
-from sceneprior.evaluation.metrics.novelty import KnownRooms
+from sceneprior.interchange.export import SIMULATORS, export_scenes
 from sceneprior.lifted.config import SAMPLER, TrainedLifted
 from sceneprior.paper.interpolate import RoomPath, even_places
-from sceneprior.paper.prior import TrainedPrior
+from sceneprior.paper.prior import LatentSpace, LatentSphere, TrainedPrior
 from sceneprior.paper.sampling import (
     DISTRIBUTIONS,
     decode_latents,
     named_latent,
-    to_rooms,
     with_training_latents,
 )
+from sceneprior.render.scene_files import check_names, save
 
-SOME = 64
-"""Most training rooms from which the size of rooms is estimated."""
+FORMATS = {
+    "GLB": ".glb", "JSON": ".json", "OBJ": "obj", "USD": "usd", "MuJoCo (MJCF)": "mujoco",
+    "Habitat": "habitat", "SceneEval": "sceneeval", "ATISS": "atiss", "3D-FRONT": "threed-front",
+}  # fmt: skip
+"""Formats of downloads: endings for `save`, or formats of `export_scenes`."""
 PATH_STEPS = 49
 """Number of rooms of a path with both ends; neighbours are rarely more than 4 degrees apart."""
 HERE = "here"
 """Text that names the shown room as an end of a path."""
 NOTHING_ASKED: Mapping[str, Any] = MappingProxyType({})
+MARGIN = 0.12
+"""Margin around the outermost training rooms, as a share of the map's side."""
+RIM = 0.999
+"""Largest distance from the origin on the map of a sphere. At the rim, distance 1, the latent's
+other coordinates would all become 0."""
+SNAP = 0.02
+"""Distance within which a click selects a training room, as a share of the map's side."""
+
+
+@dataclass(frozen=True)
+class LatentMap:
+    """Orthographic projection of the latent space: latent z is at the point (a_1 . z, a_2 . z).
+
+    The orthonormal axes a_1 and a_2 are the first two principal components of the training rooms'
+    latents, so no other plane shows more of their variance. A great circle projects to an arc of an
+    ellipse. Moving over the map changes two coordinates and keeps the others in proportion. A click
+    on a training room's dot gives that room itself.
+    """
+
+    space: LatentSpace
+    axes: Float[Tensor, "2 dimension"]
+    rooms: Float[Tensor, "rooms 2"]
+    """Map points of the training rooms."""
+    share: float
+    """Explained variance: the share of the latents' variance along the two axes, 0 to 1."""
+    middle: tuple[float, float]
+    side: float
+    """Side of the square that the map shows, which contains all training rooms."""
+
+    def place(self, z: Float[Tensor, "rooms dimension"]) -> Float[Tensor, "rooms 2"]:
+        """Map points of latents."""
+        return z @ self.axes.T
+
+    def moved(
+        self, z: Float[Tensor, " dimension"], point: tuple[float, float]
+    ) -> Float[Tensor, " dimension"]:
+        """Move latent z to a point of the map, keeping its other coordinates.
+
+        On the sphere the other coordinates are scaled so that the length stays 1, and a point
+        beyond the rim is moved to it.
+        """
+        here = torch.tensor(point, dtype=z.dtype)
+        rest = z - self.axes.T @ (self.axes @ z)
+        if isinstance(self.space, LatentSphere):
+            here = here * (RIM / here.norm().clamp(min=RIM))
+            rest = rest * ((1 - here.square().sum()).sqrt() / rest.norm().clamp(min=1e-6))
+        return self.space.onto((rest + self.axes.T @ here).unsqueeze(0))[0]
+
+    def room_at(self, point: tuple[float, float]) -> int | None:
+        """The training room that a click at a point selects; None if no dot is near."""
+        apart = (self.rooms - torch.tensor(point, dtype=self.rooms.dtype)).norm(dim=1)
+        row = int(apart.argmin())
+        return row if float(apart[row]) <= SNAP * self.side else None
+
+
+def make_map(space: LatentSpace, z: Float[Tensor, "rooms dimension"]) -> LatentMap:
+    """Make the map of a latent space from the training rooms' latents z.
+
+    Example: on the sphere in three dimensions, rooms differ most along x, then along y.
+
+        >>> space = LatentSphere(4, 3)
+        >>> z = [[0.6, 0.0, 0.8], [-0.6, 0.0, 0.8], [0.0, 0.3, 0.954], [0.0, -0.3, 0.954]]
+        >>> latent_map = make_map(space, torch.tensor(z))
+        >>> latent_map.rooms[0].abs().tolist()
+        [0.6000000238418579, 0.0]
+        >>> latent_map.moved(torch.tensor(z[0]), (0.0, 0.0)).tolist()
+        [0.0, 0.0, 1.0]
+    """
+    if len(z) < 3:
+        raise InputError(
+            f"A map of the latent space needs at least 3 training rooms, and this prior knows "
+            f"{len(z)}; sample rooms instead."
+        )
+    _, scale, directions = torch.linalg.svd(z - z.mean(dim=0), full_matrices=False)
+    # The signs of singular vectors are arbitrary: the largest entry becomes positive.
+    largest: Int[Tensor, "2 1"] = directions[:2].abs().argmax(dim=1, keepdim=True)
+    axes = directions[:2] * directions.gather(1, largest).sign()
+    rooms = z @ axes.T
+    low, high = rooms.amin(dim=0), rooms.amax(dim=0)
+    side = max(float((high - low).max()), 1e-3) * (1 + 2 * MARGIN)
+    share = float(scale[:2].square().sum() / scale.square().sum().clamp(min=1e-12))
+    x, y = ((low + high) / 2).tolist()
+    return LatentMap(space, axes, rooms, share, (x, y), side)
+
+
+def name_and_size(item: SceneObject) -> str:
+    """Text of an object's label: class name, and width, height and depth in metres.
+
+    >>> name_and_size(SceneObject("double_bed", (0.0, 0.5, 0.0), (1.8, 1.0, 2.1)))
+    'double bed 1.80 x 1.00 x 2.10 m'
+    """
+    return item.label.replace("_", " ") + " {:.2f} x {:.2f} x {:.2f} m".format(*item.size_m)
+
+
+@dataclass
+class Display:
+    """Choices of what is shown with a room."""
+
+    shell: ShellName
+    """Parts of the room itself. If neither floor nor walls are shown, a grid is."""
+    names: bool = False
+    """Names and sizes of all objects."""
+    boxes: bool = False
+    models: bool = False
+    """CAD models in place of the meshes of the prior or of the scene files."""
 
 
 @dataclass(frozen=True)
@@ -67,10 +179,6 @@ class Folder:
     def label_set(self) -> str:
         """The label set of all scenes; several are an InputError."""
         return common_label_set(self.scenes)
-
-    def layouts(self) -> Sequence[Scene]:
-        """Rooms from which the size of rooms is estimated: all of the folder."""
-        return self.scenes
 
     def room(self, row: int) -> Shown:
         """The scene at an index."""
@@ -199,41 +307,33 @@ class Explorer:
         (room,) = self.path.rooms(place, [f"step_{number:02d}"])
         return Shown(room.scene, f"path, step {number} of {PATH_STEPS - 1}")
 
-    def nearest(self, scene: Scene) -> tuple[Shown, float]:
-        """The decoded training room with the nearest layout, and its distance in metres."""
-        row, distance_m = KnownRooms(self._training_layouts).nearest(scene)
-        return self.training_room(row), distance_m
 
-    def layouts(self) -> Sequence[Scene]:
-        """Rooms from which the size of rooms is estimated: some training rooms, or new ones."""
-        if self.map is not None:
-            most = len(self._training_z)
-            return self._boxes_of(range(0, most, -(-most // SOME)))
-        return self.prior.sample(16, 0, next(iter(self.distributions), None))
+def download(scene: Scene, form: str, shell: ShellName) -> tuple[str, bytes, list[str]]:
+    """The name of a room's file, its bytes, and notes for the user; several files are zipped.
 
-    @cached_property
-    def _training_layouts(self) -> list[Scene]:
-        return self._boxes_of(range(len(self._training_z)))
+    Args:
+        form: One of `FORMATS`.
+        shell: Parts of the room itself to write, in the formats that leave a choice.
 
-    def _boxes_of(self, rows: Sequence[int]) -> list[Scene]:
-        """Training rooms as the prior decodes them, without shapes; a second for 500 rooms."""
-        trained = self.prior.with_latents
-        with torch.no_grad():
-            decoded = trained.prior.decode(self._training_z[list(rows)], with_shape=False)
-        names = [trained.room_ids[row] for row in rows]
-        target = trained.config.model.completeness_target
-        rooms = to_rooms(decoded, trained.prior, self.label_set, names, target)
-        return [room.scene for room in rooms]
-
-
-def floor_side_m(scenes: Sequence[Scene]) -> float:
-    """Side of a square floor around the origin that holds the furniture of most rooms.
-
-    It is the 80% quantile over rooms, rounded up to whole metres, at least 4.
+    Raises:
+        InputError: the room cannot be written, or a package for it is not installed.
     """
-    reach = [
-        np.abs(scene.centers_m[:, [0, 2]]).max() + scene.sizes_m[:, [0, 2]].max() / 2
-        for scene in scenes
-        if scene.objects
-    ]
-    return max(4.0, float(np.ceil(2 * np.quantile(reach, 0.8)))) if reach else 4.0
+    check_names([scene])
+    to, notes = FORMATS[form], []
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        if to.startswith("."):
+            save(scene, folder / f"{scene.name}{to}", shell=shell)
+        else:
+            chosen = shell if to in (*SIMULATORS, "obj") else None
+            notes = export_scenes([scene], to, folder, chosen)
+        files = sorted(path for path in folder.rglob("*") if path.is_file())
+        if len(files) == 1 and files[0].parent == folder:
+            return files[0].name, files[0].read_bytes(), notes
+        packed = io.BytesIO()
+        with zipfile.ZipFile(packed, "w") as archive:
+            for path in files:
+                # The entry has no date of today, so that the same room is the same file.
+                entry = zipfile.ZipInfo(path.relative_to(folder).as_posix())
+                archive.writestr(entry, path.read_bytes(), zipfile.ZIP_DEFLATED)
+    return f"{scene.name}_{to}.zip", packed.getvalue(), notes

@@ -1,5 +1,6 @@
-"""The viewer's 3D scene: a room, the map to its left, the nearest training room to its right."""
+"""The page's 3D scene: a room, and to its left the board with the map of the latent space."""
 
+import math
 import threading
 import traceback
 from collections.abc import Callable, Mapping
@@ -7,34 +8,47 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from sceneprior.apps.retrieval.cad_models import CadModels, made_models
 from sceneprior.apps.retrieval.retrieve import retrieve
-from sceneprior.apps.viewer.explorer import NOTHING_ASKED, Explorer, Folder, Shown, floor_side_m
-from sceneprior.apps.viewer.scene_nodes import Board, Display, Point, RoomNodes
+from sceneprior.apps.viewer.explorer import (
+    NOTHING_ASKED,
+    Display,
+    Explorer,
+    Folder,
+    LatentMap,
+    Shown,
+    name_and_size,
+)
+from sceneprior.core.boxes import BOX_EDGES, box_corners
 from sceneprior.core.errors import InputError
-from sceneprior.core.scene import Scene
-from sceneprior.core.shell import ShellName, shell_of
-from sceneprior.render.appearance import scene_meshes
+from sceneprior.core.shell import ShellName, shell_meshes, shell_of
+from sceneprior.render.appearance import object_colors, object_mesh, scene_meshes, shell_color
 
 if TYPE_CHECKING:
     import viser
 
 FOV_RAD = 0.75
 """Vertical field of view of the camera."""
-ASPECT = 1.3
-"""Width-to-height ratio of the window, until a browser reports its own."""
 CORNER = np.array([-0.42, -0.62, -0.66])
 """Viewing direction if only a room is shown, as in the pictures of rooms."""
 FRONT = np.array([0.0, -0.6, -0.8])
 """Viewing direction if a room is shown beside the map, which faces the camera."""
 MARGIN = 0.92
 """Share of the window that the points may fill."""
+FLOOR_M = 6.0
+"""Least side of the floor beside which the board stands."""
 GAP = 0.06
-"""Gap between the room and its neighbours, relative to the width of the room's floor."""
-SMALL = 0.55
-"""The cameras are framed again if the room's sides fall below this share of the framed box's."""
+"""Gap between the floor and the board, relative to the floor's side."""
+LEAN_RAD = math.radians(40)
+"""Tilt of the board, about the elevation of the page's initial camera."""
+_BOX, _KEPT = (120, 120, 120), (230, 120, 20)
+_BOARD, _DOT, _PATH, _HERE = (244, 243, 238), (70, 92, 140), (214, 110, 30), (200, 30, 60)
+Point = tuple[float, float]
+"""A point of the map."""
 
 
 class Page:
@@ -59,30 +73,23 @@ class Page:
         self.shown = source.room(0) if isinstance(source, Folder) else source.sample(0, None, asked)
         self.scene = self.shown.scene
         """The displayed scene: the scene of `shown`, with CAD models if they are chosen."""
-        self.nearest: tuple[Shown, float] | None = None
-        """The training room beside the room, and its distance in metres, if it is shown."""
         self.on_show: Callable[[], None] = lambda: None
         """Called after each change of the shown room."""
         # Callbacks come from many threads, and a callback may trigger another in its own thread.
         self._lock = threading.RLock()
         self._newest: Callable[[], None] | None = None
         self._follower = ThreadPoolExecutor(1)
-        self._floor_m = floor_m = floor_side_m(source.layouts())
-        self._room = RoomNodes(server, "/room", 0.0, floor_m, self._clicked)
-        self._beside_m = floor_m * (1 + GAP)
-        self._beside = RoomNodes(server, "/nearest", self._beside_m, floor_m)
-        self._beside.frame.visible = False
+        self._nodes: list[Any] = []
+        floor_m = max(FLOOR_M, 2 * float(np.abs(self._room_points()[:, [0, 2]]).max()))
+        self._grid = server.scene.add_grid(
+            "/grid", floor_m, floor_m, plane="xz", position=(0.0, -0.005, 0.0),
+            plane_color=(236, 233, 226), plane_opacity=1.0, cell_color=(222, 218, 208),
+            section_color=(196, 190, 178),
+        )  # fmt: skip
         self.board: Board | None = None
         """The map's board; None if the source has no map."""
         if isinstance(source, Explorer) and source.map is not None:
-            side = 0.85 * floor_m
-            center = (-floor_m / 2 - GAP * floor_m - side / 2, 0.4 * side, -0.1 * floor_m)
-            self.board = Board(server, source.map, center, side, self._pointed)
-        self._direction = CORNER if self.board is None else FRONT
-        self._bounds_m = np.zeros((2, 3))
-        """Lowest and highest corner of the room when it was framed."""
-        self._eyes: dict[int, np.ndarray] = {}
-        """The place to which the page has moved each browser's camera."""
+            self.board = Board(server, source.map, floor_m, self._pointed)
         server.scene.set_up_direction("+y")
         server.initial_camera.fov = FOV_RAD
         self.show(self.shown)
@@ -95,96 +102,87 @@ class Page:
             if settled and self.display.models:
                 self.scene = retrieve(shown.scene, self.models)
             with self.server.atomic():
-                self._room.show(self.scene, self.display, shown.kept)
+                self._draw()
                 if self.board is not None:
                     self.board.mark(shown.scene.latent)
                 self.on_show()
-            if settled:
-                self._show_nearest()
-                if self._is_framed_badly():
-                    self.frame()
 
-    def _show_nearest(self) -> None:
-        """Show the training room nearest to the room, or hide it."""
-        before, self.nearest = self.nearest, None
-        if self.display.nearest and isinstance(self.source, Explorer):
-            self.nearest = self.source.nearest(self.scene)
-            self._beside.show(self.nearest[0].scene, self.display)
-        self._beside.frame.visible = self.nearest is not None
-        if (before is None) != (self.nearest is None):
-            self.frame()
-        self.on_show()
+    def _draw(self) -> None:
+        """Replace the nodes of the room; objects that the user keeps get an orange box and a
+        name."""
+        scene, display, add = self.scene, self.display, self.server.scene
+        while self._nodes:
+            self._nodes.pop().remove()
+        is_walled = display.shell == "walls"
+        shell = shell_of(scene).inner_meshes() if is_walled else shell_meshes(scene, display.shell)
+        self._grid.visible = not shell
+        self._nodes += [
+            add.add_mesh_simple(
+                f"/room/{name}", mesh.vertices_m, mesh.faces, flat_shading=True, side="front",
+                color=tuple(shell_color(name).tolist()), cast_shadow=False,
+            )
+            for name, mesh in shell.items()
+        ]  # fmt: skip
+        for row, (item, color) in enumerate(
+            zip(scene.objects, object_colors(scene).tolist(), strict=True)
+        ):
+            mesh = object_mesh(item)
+            node = add.add_mesh_simple(
+                f"/room/object_{row}", np.asarray(mesh.vertices_m), mesh.faces, color=tuple(color),
+                flat_shading=True, side="double",
+            )  # fmt: skip
+            node.on_click(lambda _, row=row: self.safely(lambda: self._toggle(row)))
+            self._nodes.append(node)
+            is_kept, (x, y, z) = row in self.shown.kept, item.center_m
+            if display.names or is_kept:
+                self._nodes.append(add.add_label(
+                    f"/room/name_{row}", name_and_size(item), anchor="bottom-center",
+                    position=(x, y + item.size_m[1] / 2 + 0.05, z),
+                ))  # fmt: skip
+            if display.boxes or is_kept:
+                (corners,) = box_corners(scene.centers_m[[row]], scene.sizes_m[[row]])
+                self._nodes.append(add.add_line_segments(
+                    f"/room/box_{row}", corners[np.array(BOX_EDGES)], _KEPT if is_kept else _BOX,
+                    thickness=2, thickness_units="screen",
+                ))  # fmt: skip
 
-    # -- Cameras -----------------------------------------------------------------------------------
-
-    def frame(self, turned: bool = False) -> None:
-        """Move all cameras so that everything is visible.
-
-        Args:
-            turned: Use the page's viewing direction instead of each camera's current one.
-        """
-        self._bounds_m = self._room_bounds()
-        camera = self.server.initial_camera
-        camera.position, camera.look_at = framed(self._points(), self._direction, FOV_RAD, ASPECT)
+    def frame(self) -> None:
+        """Move all cameras so that everything is visible."""
         for client in self.server.get_clients().values():
-            self._place(client, turned)
-
-    def _place(self, client: "viser.ClientHandle", turned: bool) -> None:
-        from viser.transforms import SO3
-
-        camera = client.camera
-        forward = SO3(np.asarray(camera.wxyz)).as_matrix()[:, 2]
-        if turned or abs(forward[1]) > 0.99:
-            forward = self._direction
-        with client.atomic():
-            eye, camera.look_at = framed(self._points(), forward, camera.fov, camera.aspect)
-            camera.position = self._eyes[client.client_id] = eye
+            self._frame(client)
 
     def _connected(self, client: "viser.ClientHandle") -> None:
-        """Frame the room in a new browser's window, and again when the window changes its shape,
-        unless the user has moved the camera."""
+        """Frame the room in a new browser's window, and again when the window changes its shape."""
         aspect = 0.0
 
         def update(camera: Any) -> None:
             nonlocal aspect
-            own = self._eyes.get(client.client_id)
-            reshaped = abs(camera.aspect - aspect) > 0.01
-            aspect = camera.aspect
-            if own is None or (reshaped and np.allclose(camera.position, own, atol=0.02)):
-                self._place(client, turned=True)
+            if abs(camera.aspect - aspect) > 0.01:
+                aspect = camera.aspect
+                self._frame(client)
 
         update(client.camera)
         client.camera.on_update(update)
 
-    def _points(self) -> Float[np.ndarray, "points 3"]:
-        """Points that cameras must show: the room, the map, and the room beside it if shown."""
-        points, half = [box_points(self._room_bounds())], self._floor_m / 2
+    def _frame(self, client: "viser.ClientHandle") -> None:
+        camera, points, direction = client.camera, self._room_points(), CORNER
         if self.board is not None:
-            points += [
-                self.board.corners_m(), box_points(np.array([[-half, 0, -half], [half, 0, half]]))
-            ]  # fmt: skip
-        if self._beside.frame.visible:
-            x_m = self._beside_m
-            points.append(box_points(np.array([[x_m - half, 0, -half], [x_m + half, 2, half]])))
+            points, direction = np.concatenate([points, self.board.corners_m()]), FRONT
+        with client.atomic():
+            eye, target = framed(points, direction, camera.fov, camera.aspect)
+            camera.position, camera.look_at = eye, target
+
+    def _room_points(self) -> Float[np.ndarray, "points 3"]:
+        """Vertices of the furniture, and corners of the floor and of the walls if shown."""
+        shell, points = shell_of(self.scene), [m.vertices_m for m in scene_meshes(self.scene)]
+        for height_m in (0.0, shell.height_m)[: 1 + (self.display.shell == "walls")]:
+            points.append(np.insert(shell.outline_m, 1, height_m, axis=1))
         return np.concatenate(points)
 
-    def _room_bounds(self) -> Float[np.ndarray, "2 3"]:
-        return room_bounds(self.scene, self.display.shell == "walls")
-
-    def _is_framed_badly(self) -> bool:
-        low, high = self._room_bounds()
-        framed_low, framed_high = self._bounds_m
-        outside = (low < framed_low - 0.05).any() or (high > framed_high + 0.05).any()
-        return bool(outside or ((high - low) < SMALL * (framed_high - framed_low))[[0, 2]].any())
-
-    # -- Events ------------------------------------------------------------------------------------
-
-    def _clicked(self, item: int) -> None:
-        def keep() -> None:
-            if item < len(self.shown.scene.objects):
-                self.show(self.shown.toggled(item))
-
-        self.safely(keep)
+    def _toggle(self, item: int) -> None:
+        """Keep an object, or release it."""
+        if item < len(self.shown.scene.objects):
+            self.show(self.shown.toggled(item))
 
     def _pointed(self, point: Point, how: str) -> None:
         source = self.source
@@ -194,13 +192,14 @@ class Page:
     def follow(self, task: Callable[[], None]) -> None:
         """Queue a task, replacing one that has not started, so that the room keeps up with the
         pointer."""
-        self._newest = task
-        self._follower.submit(self._do_newest)
 
-    def _do_newest(self) -> None:
-        task, self._newest = self._newest, None
-        if task is not None:
-            self.safely(task)
+        def do_newest() -> None:
+            newest, self._newest = self._newest, None
+            if newest is not None:
+                self.safely(newest)
+
+        self._newest = task
+        self._follower.submit(do_newest)
 
     def safely(self, task: Callable[[], None]) -> None:
         """Run a browser's request under the lock; errors are shown as notifications."""
@@ -245,16 +244,101 @@ def framed(
     return eye, eye + (depth.mean() + max(away)) * forward
 
 
-def room_bounds(scene: Scene, walls: bool) -> Float[np.ndarray, "2 3"]:
-    """The lowest and highest corner of a room's floor, furniture and, if shown, walls."""
-    shell = shell_of(scene)
-    points = [mesh.vertices_m for mesh in scene_meshes(scene)]
-    for height_m in (0.0, shell.height_m)[: 1 + walls]:
-        points.append(np.insert(shell.outline_m, 1, height_m, axis=1))
-    every = np.concatenate(points)
-    return np.stack([every.min(axis=0), every.max(axis=0)])
+class Board:
+    """The map of the latent space as a tilted square to the left of a floor, for clicks and drags.
 
+    Args:
+        floor_m: Side of the floor.
+        pointed: Called with a map point and the kind of event: `click`, `drag`, or `end` of a drag.
+    """
 
-def box_points(bounds_m: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "8 3"]:
-    """The eight corners of a box, from its lowest and highest corner."""
-    return np.stack(np.meshgrid(*bounds_m.T), axis=-1).reshape(8, 3)
+    def __init__(
+        self,
+        server: "viser.ViserServer",
+        latent_map: LatentMap,
+        floor_m: float,
+        pointed: Callable[[Point, str], None],
+    ):
+        self.latent_map, self._side_m = latent_map, (side_m := 0.85 * floor_m)
+        x_m = -floor_m / 2 - GAP * floor_m - side_m / 2
+        self._center_m = np.array([x_m, 0.4 * side_m, -0.1 * floor_m])
+        cos, sin = math.cos(LEAN_RAD), math.sin(LEAN_RAD)
+        self._rotation = np.array([[1.0, 0, 0], [0, cos, sin], [0, -sin, cos]])
+        self._scene = scene = server.scene
+        half_rad = LEAN_RAD / 2  # the board's normal, z, is tilted up from the room's z
+        wxyz = (math.cos(half_rad), -math.sin(half_rad), 0.0, 0.0)
+        scene.add_frame("/map", show_axes=False, wxyz=wxyz, position=self._center_m)
+        face = scene.add_box(
+            "/map/board", color=_BOARD, dimensions=(side_m, side_m, 0.02), position=(0, 0, -0.01)
+        )
+        # Dots are spheres, raised so that they do not intersect the board's face.
+        scene.add_point_cloud(
+            "/map/rooms", self.on_board(latent_map.rooms, 0.02 * side_m), np.array(_DOT),
+            point_size=0.014 * side_m, point_shape="circle", point_shading="flat",
+            precision="float32",
+        )  # fmt: skip
+        self._here = scene.add_icosphere(
+            "/map/here", radius=0.022 * side_m, color=_HERE, visible=False
+        )
+        scene.add_label(
+            "/map/name", f"latent space: {len(latent_map.rooms)} training rooms",
+            anchor="bottom-center", position=(0, side_m / 2 + 0.05, 0),
+        )  # fmt: skip
+
+        @face.on_click
+        async def _(event: Any) -> None:
+            if (point := self.hit(event.ray_origin, event.ray_direction)) is not None:
+                pointed(point, "click")
+
+        # Asynchronous callbacks keep events in order; the work is done in a thread.
+        @face.on_drag("left")
+        async def _(event: Any) -> None:
+            eye = event.client.camera.position
+            point = self.hit(eye, np.array(event.end_position) - eye)
+            if point is not None:
+                pointed(point, "end" if event.phase == "end" else "drag")
+
+    def on_board(
+        self, places: Float[Tensor, "n 2"], above_m: float = 0.0
+    ) -> Float[np.ndarray, "n 3"]:
+        """Points of the map in the board's frame, `above_m` above its face."""
+        middle = torch.tensor(self.latent_map.middle, dtype=places.dtype)
+        flat = ((places - middle) / self.latent_map.side * self._side_m).double().numpy()
+        return np.hstack([flat, np.full((len(flat), 1), above_m)])
+
+    def in_scene(self, board_m: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Points of the board's frame in scene coordinates."""
+        return board_m @ self._rotation.T + self._center_m
+
+    def corners_m(self) -> Float[np.ndarray, "4 3"]:
+        """Corners of the board in scene coordinates."""
+        half = self._side_m / 2
+        return self.in_scene(np.array([[x, y, 0.0] for x in (-half, half) for y in (-half, half)]))
+
+    def hit(self, origin_m: Any, direction: Any) -> Point | None:
+        """The map point hit by a ray of the scene, clamped to the board's edge.
+
+        None if the ray is parallel to the board or points away from it.
+        """
+        start = (np.asarray(origin_m, dtype=np.float64) - self._center_m) @ self._rotation
+        way = np.asarray(direction, dtype=np.float64) @ self._rotation
+        if start[2] * way[2] >= 0:
+            return None
+        flat = (start - way * (start[2] / way[2]))[:2] / self._side_m
+        x, y = flat.clip(-0.5, 0.5) * self.latent_map.side + np.array(self.latent_map.middle)
+        return (float(x), float(y))
+
+    def mark(self, latent: np.ndarray | None) -> None:
+        """Mark the point of a latent; None hides the mark."""
+        self._here.visible = latent is not None
+        if latent is not None:
+            place = self.latent_map.place(torch.from_numpy(latent).unsqueeze(0))
+            self._here.position = self.on_board(place, 0.02 * self._side_m)[0]
+
+    def draw_path(self, z: Float[Tensor, "steps dimension"]) -> None:
+        """Draw the line of a path, in place of the previous one."""
+        points = self.on_board(self.latent_map.place(z), 0.03 * self._side_m)
+        self._scene.add_line_segments(
+            "/map/path", np.stack([points[:-1], points[1:]], axis=1), _PATH, thickness=3,
+            thickness_units="screen",
+        )  # fmt: skip

@@ -1,33 +1,43 @@
 """The page's control panel: new rooms, requests, paths, completion, display and downloads."""
 
-import io
-import zipfile
 from collections.abc import Callable, Mapping
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from markupsafe import Markup
+
 from sceneprior.apps.retrieval.cad_models import CadModels
-from sceneprior.apps.viewer.explorer import HERE, NOTHING_ASKED, PATH_STEPS, Explorer, Folder
+from sceneprior.apps.viewer.explorer import (
+    FORMATS,
+    HERE,
+    NOTHING_ASKED,
+    PATH_STEPS,
+    Explorer,
+    Folder,
+    Shown,
+    download,
+    name_and_size,
+)
 from sceneprior.apps.viewer.page import Page
-from sceneprior.apps.viewer.panel_html import error_html, html, room_html, wishes_html
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene
 from sceneprior.core.shell import SHELLS, ShellName
-from sceneprior.interchange.export import SIMULATORS, export_scenes
 from sceneprior.lifted.requests.request import RoomRequest
-from sceneprior.render.scene_files import check_names, save
+from sceneprior.render.appearance import object_colors
 
 if TYPE_CHECKING:
     import viser
 
-FURNITURE = DECODED, MODELS = "decoded", "models"
-"""The choices of `Furniture`: the meshes of the prior or the scene files, or CAD models."""
-FORMATS = {
-    "GLB": ".glb", "JSON": ".json", "OBJ": "obj", "USD": "usd", "MuJoCo (MJCF)": "mujoco",
-    "Habitat": "habitat", "SceneEval": "sceneeval", "ATISS": "atiss", "3D-FRONT": "threed-front",
-}  # fmt: skip
-"""Formats of downloads: endings for `save`, or formats of `export_scenes`."""
+_TEXT = Markup('<div style="padding: 0 0.8em 0.8em; font-size: 0.875em">{}</div>')
+_LIST = Markup(
+    '<ul style="margin: 0.4em 0; padding: 0; list-style: none; max-height: 13.5em; '
+    'overflow-y: auto">{}</ul>'
+)
+_SWATCH = Markup(
+    '<span style="display: inline-block; width: 0.8em; height: 0.8em; margin-right: 0.5em; '
+    'border-radius: 2px; background: rgb({}, {}, {})"></span>'
+)
+_WORSE = Markup('<span style="color: #c02020">{}</span>')
 _FIELDS = {
     "floor": ("Floor", "4x3 (metres), or corners: 0,0 5,0 5,3 2,3 2,5 0,5. Empty: any floor."),
     "openings": ("Doors", "door, window@north, door@0:1.5 (1.5 m along the wall from corner 0)"),
@@ -59,7 +69,6 @@ class Panel:
         self.page, self._gui = page, page.server.gui
         self._room_text = self._gui.add_html("")
         self._wishes_text: Any = None
-        self._nearest_text: Any = None
         self.request: RequestFields | None = None
         source = page.source
         if isinstance(source, Folder):
@@ -69,24 +78,24 @@ class Panel:
         self._add_show()
         self._add_download()
         if isinstance(source, Explorer):
-            self._add_map(source)
+            if source.map is None:
+                self._gui.add_html(html(source.without_map))
+            else:
+                self._gui.add_markdown(
+                    "**Map**: drag over the board, or click a dot, which is a training room. The "
+                    "map shows the two directions in which the training rooms' latents differ most "
+                    f"({source.map.share:.0%} of the variance); all other coordinates stay."
+                )
             if source.has_latents:
                 self._add_path(source)
         page.on_show = self._describe
         self._describe()
 
     def _describe(self) -> None:
-        """Describe the shown room, its wishes, and the nearest training room."""
-        page = self.page
-        self._room_text.content = html(room_html(page.shown, page.scene))
+        """Describe the shown room and its wishes."""
+        self._room_text.content = html(room_html(self.page.shown, self.page.scene))
         if self._wishes_text is not None:
-            self._wishes_text.content = html(wishes_html(page.scene))
-        if self._nearest_text is not None:
-            self._nearest_text.content = ""
-            if page.nearest is not None:
-                room, distance_m = page.nearest
-                text = f"Right: {room.origin}; {distance_m:.2f} m away in layout."
-                self._nearest_text.content = html(text)
+            self._wishes_text.content = html(wishes_html(self.page.scene))
 
     def _add_folder(self, folder: Folder) -> None:
         count = len(folder.scenes)
@@ -96,11 +105,6 @@ class Panel:
         page = self.page
         number: Any = self._gui.add_slider("Room", min=1, max=count, step=1, initial_value=1)
         number.on_update(lambda _: page.follow(lambda: page.show(folder.room(number.value - 1))))
-
-        def turn(by: int) -> None:
-            number.value = 1 + (number.value - 1 + by) % count
-
-        self._buttons({"Previous": lambda: turn(-1), "Next": lambda: turn(1)})
 
     def _add_sampling(self, explorer: Explorer, asked: Mapping[str, Any]) -> None:
         gui, page = self._gui, self.page
@@ -146,19 +150,9 @@ class Panel:
                 self._wishes_text.content = html("Looking for a room ...")
             shown = explorer.sample(seed, distribution, asked)
         except InputError as error:
-            self._wishes_text.content = html(error_html(str(error)))
+            self._wishes_text.content = html(_WORSE.format(error))
             raise
         self.page.show(shown)
-
-    def _add_map(self, explorer: Explorer) -> None:
-        if explorer.map is None:
-            self._gui.add_html(html(explorer.without_map))
-            return
-        self._gui.add_markdown(
-            "**Map**: drag over the board, or click a dot, which is a training room. The map shows "
-            "the two directions in which the training rooms' latents differ most "
-            f"({explorer.map.share:.0%} of the variance); all other coordinates stay."
-        )
 
     def _add_path(self, explorer: Explorer) -> None:
         gui, page = self._gui, self.page
@@ -189,35 +183,25 @@ class Panel:
     def _add_show(self) -> None:
         gui, page = self._gui, self.page
         with gui.add_folder("Show"):
-            self.shell = self._choice(
-                "shell", gui.add_dropdown(
-                    "Shell", SHELLS, initial_value=page.display.shell,
-                    hint="Floor and walls, the floor, or neither; in downloads, too",
-                ),
+            choice = gui.add_dropdown(
+                "Shell", SHELLS, initial_value=page.display.shell,
+                hint="Floor and walls, the floor, or neither; in downloads, too",
             )  # fmt: skip
-            self.names = self._choice("names", gui.add_checkbox("Names and sizes", False))
+            self._choice("shell", choice)
+            self._choice("names", gui.add_checkbox("Names and sizes", False))
             self._choice("boxes", gui.add_checkbox("Boxes", False))
-            self.furniture = self._choice(
-                "models", gui.add_dropdown("Furniture", FURNITURE, initial_value=DECODED),
-                lambda value: value == MODELS,
-            )  # fmt: skip
-            if page.board is not None:
-                self._choice("nearest", gui.add_checkbox("Nearest training room", False))
-                self._nearest_text = gui.add_html("")
-            self._buttons({"Whole room in view": lambda: page.frame(True)})
+            self._choice("models", gui.add_checkbox("CAD models", False))
+            self._buttons({"Whole room in view": lambda: page.frame()})
 
-    def _choice(
-        self, name: str, control: Any, convert: Callable[[Any], Any] = lambda value: value
-    ) -> Any:
+    def _choice(self, name: str, control: Any) -> None:
         """Let a control choose the value `name` of the page's display."""
         page = self.page
 
         def chosen() -> None:
-            setattr(page.display, name, convert(control.value))
+            setattr(page.display, name, control.value)
             page.show(page.shown)
 
         control.on_update(lambda _: page.safely(chosen))
-        return control
 
     def _add_download(self) -> None:
         with self._gui.add_folder("Download"):
@@ -285,32 +269,46 @@ class RequestFields:
         self._rest, self.rest_text.visible = {}, False
 
 
-def download(scene: Scene, form: str, shell: ShellName) -> tuple[str, bytes, list[str]]:
-    """The name of a room's file, its bytes, and notes for the user; several files are zipped.
+def html(text: str) -> str:
+    """Text for the panel, escaped unless it is `Markup`.
 
-    Args:
-        form: One of `FORMATS`.
-        shell: Parts of the room itself to write, in the formats that leave a choice.
-
-    Raises:
-        InputError: the room cannot be written, or a package for it is not installed.
+    Names from files are shown only by this function, never as Markdown: viser executes HTML in
+    Markdown, and reads its images from the server's files.
     """
-    check_names([scene])
-    to, notes = FORMATS[form], []
-    with TemporaryDirectory() as name:
-        folder = Path(name)
-        if to.startswith("."):
-            save(scene, folder / f"{scene.name}{to}", shell=shell)
-        else:
-            chosen = shell if to in (*SIMULATORS, "obj") else None
-            notes = export_scenes([scene], to, folder, chosen)
-        files = sorted(path for path in folder.rglob("*") if path.is_file())
-        if len(files) == 1 and files[0].parent == folder:
-            return files[0].name, files[0].read_bytes(), notes
-        packed = io.BytesIO()
-        with zipfile.ZipFile(packed, "w") as archive:
-            for path in files:
-                # The entry has no date of today, so that the same room is the same file.
-                entry = zipfile.ZipInfo(path.relative_to(folder).as_posix())
-                archive.writestr(entry, path.read_bytes(), zipfile.ZIP_DEFLATED)
-    return f"{scene.name}_{to}.zip", packed.getvalue(), notes
+    return str(_TEXT.format(text))
+
+
+def room_html(shown: Shown, scene: Scene) -> Markup:
+    """The shown room: its origin, its floor, and its objects in the colours of their classes, with
+    kept objects in bold."""
+    lines = []
+    for row, (item, color) in enumerate(
+        zip(scene.objects, object_colors(scene).tolist(), strict=True)
+    ):
+        name = Markup("<b>{}</b>" if row in shown.kept else "{}").format(name_and_size(item))
+        lines.append(Markup("<li>{}{}</li>").format(_SWATCH.format(*color), name))
+    rows = Markup().join(lines) or Markup("<li>nothing: an empty room</li>")
+    floor = Markup()
+    if scene.floor_m is not None:
+        x, z = np.ptp(scene.floor_m, axis=0)
+        parts = [f"{x:.2f} x {z:.2f} m"]
+        for kind in ("door", "window"):
+            if count := sum(each.kind == kind for each in scene.openings):
+                parts.append(f"{count} {kind}{'s' * (count > 1)}")
+        floor = Markup("<br>Floor: {}").format(", ".join(parts))
+    return Markup("<b>{}</b>{}{}").format(shown.origin, floor, _LIST.format(rows))
+
+
+def wishes_html(scene: Scene) -> Markup:
+    """The wishes of a requested room, each marked as fulfilled or not."""
+    wishes: Any = scene.extra.get("wishes")
+    if not isinstance(wishes, list) or not wishes:  # a file may hold anything
+        return Markup()
+    lines = []
+    for each in wishes:
+        if isinstance(each, dict):
+            wish = str(each.get("wish")).replace("_", " ")
+            holds = each.get("holds") is True
+            text = f"✓ {wish}" if holds else _WORSE.format(f"✗ {wish}: not fulfilled")
+            lines.append(Markup("<li>{}</li>").format(text))
+    return Markup("<b>Wishes</b>{}").format(_LIST.format(Markup().join(lines)))

@@ -10,9 +10,7 @@ from tiny_runs import tiny_baseline
 
 import sceneprior
 from sceneprior.apps.api import Prior
-from sceneprior.apps.viewer import explorer as explorers
-from sceneprior.apps.viewer.explorer import PATH_STEPS, Explorer, Folder, Shown, floor_side_m
-from sceneprior.apps.viewer.latent_map import SNAP, make_map
+from sceneprior.apps.viewer.explorer import PATH_STEPS, SNAP, Explorer, Folder, Shown, make_map
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.paper.prior import LatentCube, LatentSphere
@@ -91,26 +89,13 @@ def test_completion_keeps_what_is_kept():
     assert done.origin == "completed around 1 kept objects, seed 2"
 
 
-def test_the_nearest_training_room(explorer, prior):
-    rooms = decode_training_rooms(prior.trained)
-    shown, distance_m = explorer.nearest(rooms[4])
-    assert distance_m == pytest.approx(0, abs=1e-4)
-    assert same(shown.scene, next(room for room in rooms if room.name == shown.scene.name))
-
-
-def test_a_page_waits_for_some_training_rooms_only(prior, monkeypatch):
-    monkeypatch.setattr(explorers, "SOME", 4)
-    explorer, rooms = Explorer(prior), prior.trained.room_ids
-    assert [room.name for room in explorer.layouts()] == list(rooms[:: -(-len(rooms) // 4)])
-
-
 def test_without_latents_there_are_new_rooms_and_no_map(prior, toy_shards):
     bare = replace(prior.trained, logits=prior.trained.logits[:0], room_ids=())
     explorer = Explorer(Prior(bare, "bare"))
     assert explorer.map is None and explorer.has_latents
     assert explorer.without_map.startswith("The map needs the latents of training rooms, and this ")
     assert explorer.distributions == ("paper",)
-    assert explorer.sample(0).origin == "seed 0, from: paper" and explorer.layouts()
+    assert explorer.sample(0).origin == "seed 0, from: paper"
     config = tiny_baseline(toy_shards, "atiss")  # a method without a latent space
     networks = config.networks(config.stage_names[-1], 3)
     explorer = Explorer(Prior(config.trained(networks, config.stage_names[-1], ()), "other"))
@@ -123,8 +108,6 @@ def test_a_folder_s_rooms():
     bed = SceneObject("double_bed", (1.0, 0.5, -2.0), (2.0, 1.0, 2.0))
     scenes = [Scene(name, "front3d_bedroom", (bed,)) for name in ("a", "b")]
     assert Folder(scenes).room(1) == Shown(scenes[1], "b, 2 of 2")
-    # It reaches 3 m from the origin.
-    assert floor_side_m(scenes) == 6 and floor_side_m([Scene("c", "front3d_bedroom")]) == 4
 
 
 # -- The map ---------------------------------------------------------------------------------------

@@ -6,24 +6,27 @@ import zipfile
 from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
+import torch
 from refusals import refused
 
 import sceneprior
-from sceneprior.apps.viewer.explorer import Explorer, Folder
+from sceneprior.apps.viewer.explorer import FORMATS, Display, Explorer, Folder, download, make_map
 from sceneprior.core.cameras import look_at
 from sceneprior.core.scene import Opening, Scene, SceneObject
+from sceneprior.core.shell import shell_of
 from sceneprior.interchange.export import FORMATS as EXPORT_FORMATS
 from sceneprior.interchange.export import export_scenes
+from sceneprior.paper.prior import LatentCube
 from sceneprior.render.scene_files import save
 
 pytest.importorskip("viser", reason="the extra `view` is not installed")
 
 from sceneprior.apps.viewer import page as pages
-from sceneprior.apps.viewer.panel import FORMATS, download, open_page
-from sceneprior.apps.viewer.panel_html import error_html, html, wishes_html
+from sceneprior.apps.viewer.panel import html, open_page, wishes_html
 from sceneprior.apps.viewer.server import serving
 
 CLASS = "<img src=x onerror='hacked=1'>"
@@ -48,17 +51,6 @@ def test_cameras_see_all_points_and_stand_no_further_away_than_they_must(forward
     np.testing.assert_allclose(np.cross(target - eye, forward), 0, atol=1e-9)
 
 
-def test_bounds_hold_floor_furniture_and_walls():
-    shelf = SceneObject("shelf", (1.0, 1.6, 0.0), (0.5, 3.0, 0.4))
-    scene = Scene("room", "front3d_bedroom", (shelf,), FLOOR, ceiling_m=3.5)
-    assert pages.room_bounds(scene, False).tolist() == [[-2, 0, -1.5], [2, 3.1, 1.5]]
-    assert pages.room_bounds(scene, True).tolist() == [[-2, 0, -1.5], [2, 3.5, 1.5]]
-    corners = pages.box_points(np.array([[0.0, 1, 2], [3, 4, 5]]))
-    assert sorted(map(tuple, corners.tolist())) == [
-        (x, y, z) for x in (0, 3) for y in (1, 4) for z in (2, 5)
-    ]
-
-
 def test_names_are_escaped_and_read_no_file(recwarn):
     """A class, a name and a wish out of a stranger's file are shown as they are."""
     item = SceneObject(CLASS, (0.0, 0.5, 0.0), (1.0, 1.0, 1.0))
@@ -70,7 +62,7 @@ def test_names_are_escaped_and_read_no_file(recwarn):
         panel.page.show(panel.page.shown.toggled(0))
         texts.append(panel._room_text.content)
     assert not [warning for warning in recwarn if "image" in str(warning.message)]
-    for text in (*texts, html(error_html(CLASS)), html(CLASS)):
+    for text in (*texts, html(CLASS)):
         assert "&lt;img src=x onerror=&#39;hacked=1&#39;&gt;" in text
         assert "<img" not in text and "<iframe" not in text
     assert "![]" in texts[0] and texts[1].count("not fulfilled") == 1
@@ -122,33 +114,99 @@ def test_a_request_is_answered_or_refused_in_the_panel(prior, tmp_path):
                 request.asked()
 
 
-def test_a_camera_that_the_user_has_moved_stays_when_the_window_changes_its_shape():
-    camera = SimpleNamespace(aspect=1.3, fov=0.75, wxyz=(1.0, 0, 0, 0), on_update=lambda f: None)
-    client = SimpleNamespace(client_id=7, camera=camera, atomic=nullcontext)
-    camera.on_update = lambda update: setattr(camera, "update", update)
+class FakeScene:
+    """Takes what is added, and keeps the names in order, and the newest handle of each."""
+
+    def __init__(self):
+        self.added, self.nodes = [], {}
+
+    def __getattr__(self, kind: str):
+        def add(name: str, *values, **settings):
+            self.added.append(name)
+            self.nodes[name] = MagicMock(values=values, **settings)
+            self.nodes[name].remove.side_effect = lambda: self.nodes.pop(name)
+            return self.nodes[name]
+
+        return add
+
+
+@pytest.fixture
+def fake():
+    return FakeScene()
+
+
+def drawn(fake: FakeScene, scene: Scene, shell: str, kept: tuple[int, ...] = (), **chosen: bool):
+    """The names of the nodes of a page's room."""
+    server = SimpleNamespace(
+        scene=fake, atomic=nullcontext, initial_camera=SimpleNamespace(), get_clients=dict,
+        on_client_connect=lambda _: None,
+    )  # fmt: skip
+    page = pages.Page(server, Folder([scene]), shell=shell)
+    page.display = Display(shell, **chosen)
+    page.show(replace(page.shown, kept=frozenset(kept)))
+    return {name.removeprefix("/room/") for name in fake.nodes} - {"+y"}
+
+
+def test_names_and_boxes_are_of_what_is_chosen_or_kept(fake):
+    lamp = SceneObject("pendant_lamp", (1.0, 2.0, 0.0), (0.4, 0.6, 0.4))
+    room = Scene("room", "front3d_bedroom", (BED, lamp))
+    objects = {"/grid", "object_0", "object_1"}
+    assert drawn(fake, room, "none") == objects and fake.nodes["/grid"].visible
+    assert drawn(fake, room, "none", kept=(1,)) == objects | {"name_1", "box_1"}
+    assert fake.nodes["/room/name_1"].values == ("pendant lamp 0.40 x 0.60 x 0.40 m",)
+    assert len(fake.nodes["/room/box_1"].values[0]) == 12
+    every = objects | {"name_0", "name_1", "box_0", "box_1"}
+    assert drawn(fake, room, "none", names=True, boxes=True) == every
+    assert drawn(FakeScene(), replace(room, objects=()), "none", names=True) == {"/grid"}
+
+
+def test_of_walls_only_what_faces_the_room_is_drawn(fake):
+    drawn(fake, ROOM, "walls")
+    walls = [fake.nodes[f"/room/wall_{row}"] for row in range(4)]
+    assert all(node.side == "front" for node in walls) and not fake.nodes["/grid"].visible
+    for node, wall in zip(walls, shell_of(ROOM).walls, strict=True):
+        # All faces lie in the plane of the inner face: no reveal of the door stays by itself.
+        vertices, faces = node.values
+        beyond = (vertices[faces][..., [0, 2]] - wall.start_m) @ wall.outward
+        assert len(faces) and np.abs(beyond).max() < 1e-6
+    assert (fake.nodes["/room/ceiling"].values[0][:, 1] >= 2.6).all()
+    assert drawn(FakeScene(), ROOM, "floor") == {"/grid", "floor", "object_0"}
+
+
+def test_a_ray_hits_the_board_where_a_dot_is(fake, torch_rng, rng):
+    cube = LatentCube(5)
+    latent_map = make_map(cube, cube(torch.randn(9, 5, generator=torch_rng)))
+    board = pages.Board(SimpleNamespace(scene=fake), latent_map, 4.0, lambda *_: None)
+    center_m = fake.nodes["/map"].position
+    dots_m = board.on_board(latent_map.rooms)
+    w, x, y, z = fake.nodes["/map"].wxyz  # by which viser turns the board
+    turn = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    np.testing.assert_allclose(board.in_scene(dots_m), dots_m @ turn.T + center_m, atol=1e-12)
+    for dot, place in zip(board.in_scene(dots_m), latent_map.rooms.tolist(), strict=True):
+        eye = rng.uniform([-3, 3, 3], [3, 6, 8])
+        np.testing.assert_allclose(board.hit(eye, 0.3 * (dot - eye)), place, atol=1e-6)  # float32
+    # Beside the board, its edge is hit; away from it, nothing.
+    beside = board.in_scene(np.array([[40.0, 0.0, 0.0]]))[0]
+    at_x, _ = board.hit(eye, beside - eye)
+    assert at_x == pytest.approx(latent_map.middle[0] + latent_map.side / 2)
+    assert board.hit(eye, eye - center_m) is None and board.hit(eye, [1.0, 0.0, 0.0]) is None
+
+
+def test_models_come_and_go():
     with serving("127.0.0.1", 0) as server:
         page = open_page(server, Folder([ROOM]), "rooms").page
-        page._connected(client)
-        for turned in (False, True):
-            before = camera.position = camera.position + turned
-            camera.aspect /= 2
-            camera.update(camera)
-            assert np.array_equal(camera.position, before) == turned
-
-
-def test_models_and_a_nearest_room_come_and_go(toy_run):
-    with serving("127.0.0.1", 0) as server:
-        panel = open_page(server, Explorer(sceneprior.load(toy_run)), "rooms")
-        page = panel.page
-        before = page.scene.objects
-        page.display.models = page.display.nearest = True
+        page.display.models = True
         page.show(page.shown)
         assert page.scene.extra["retrieval"] and page.scene.objects[0].mesh is not None
-        assert "m away in layout" in panel._nearest_text.content and page._beside.frame.visible
-        page.display.models = page.display.nearest = False
+        page.display.models = False
         page.show(page.shown)
-        assert page.scene.objects == before
-        assert panel._nearest_text.content == "" and not page._beside.frame.visible
+        assert page.scene.objects == ROOM.objects
 
 
 def test_every_format_of_export_is_offered():
