@@ -234,9 +234,9 @@ class Prior:
         Raises:
             InputError: the images have another label set, or the prior lacks the latents.
         """
-        from sceneprior.apps.reconstruction.reconstruct import FitOptions, reconstruct
+        from sceneprior.apps.reconstruction.reconstruct import reconstruct
 
-        return reconstruct(self.trained, images, FitOptions(fit, restarts))
+        return reconstruct(self.trained, images, fit, restarts)
 
     def latent(self, point: Point) -> Float[Tensor, " dimension"]:
         """The latent of a room, given like an end of `interpolate`.

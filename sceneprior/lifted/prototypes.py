@@ -103,30 +103,21 @@ def choose_prototypes(
         own = (grids[rows], sizes_m[rows])
         apart.append((rows, pose_distances(own, own).min(axis=2)))
     alike = ALIKE
-    items, common = _covering(apart, alike)
-    while len(items) > max(most, len(apart)):
+    while True:
+        items, common = [], []
+        for rows, distance in apart:
+            near = (distance <= alike) | np.eye(len(rows), dtype=bool)
+            first = True
+            while near.any():
+                likes = near.sum(axis=0)
+                best = int(likes.argmax())
+                items.append(rows[best])
+                common.append(first or likes[best] >= COMMON)
+                near[near[:, best]] = False  # these are represented
+                first = False
+        if len(items) <= max(most, len(apart)):
+            return np.array(items, dtype=np.int64), np.array(common, dtype=bool)
         alike *= 1.5
-        items, common = _covering(apart, alike)
-    return items, common
-
-
-def _covering(
-    apart: list[tuple[np.ndarray, np.ndarray]], alike: float
-) -> tuple[Int[np.ndarray, " prototypes"], Bool[np.ndarray, " prototypes"]]:
-    """Rows of the prototypes that `choose_prototypes` finds at the threshold `alike`, and which of
-    them are common; `apart` holds each class's rows and their distances."""
-    items, common = [], []
-    for rows, distance in apart:
-        near = (distance <= alike) | np.eye(len(rows), dtype=bool)
-        first = True
-        while near.any():
-            likes = near.sum(axis=0)
-            best = int(likes.argmax())
-            items.append(rows[best])
-            common.append(first or likes[best] >= COMMON)
-            near[near[:, best]] = False  # these are represented
-            first = False
-    return np.array(items, dtype=np.int64), np.array(common, dtype=bool)
 
 
 def embed_posed(

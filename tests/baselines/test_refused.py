@@ -8,7 +8,7 @@ from refusals import refused
 from tiny_runs import tiny_baseline, tiny_baseline_settings
 
 from sceneprior.apps.config import check_config, load_any_run, load_run
-from sceneprior.apps.reconstruction.reconstruct import FitOptions, reconstruct
+from sceneprior.apps.reconstruction.reconstruct import reconstruct
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.errors import ConfigError, ShardError
 from sceneprior.core.shards import Shard
@@ -85,7 +85,7 @@ def test_tasks_that_need_latents(baseline_run):
         "floor": lambda: sample_rooms(atiss, 2, 0, request=RoomRequest.of(floor="4x3")),
         "gan_decode": lambda: decode_training_rooms(gan),
         "gan_latent": lambda: read_latent(gan, "typo"),
-        "gan_reconstruct": lambda: reconstruct(gan, [], FitOptions()),
+        "gan_reconstruct": lambda: reconstruct(gan, []),
         "gan_kernel": lambda: sample_rooms(gan, 2, 0, "kernel"),
     }.items():
         with refused(f"baselines/{name}", run=run):
@@ -98,7 +98,7 @@ def test_tasks_of_what_reconstructs_images(baseline_run, toy_shards):
     for name, call in {
         "image_sample": lambda: sample_rooms(trained, 2, 0),
         "image_load": lambda: load_run(run),
-        "image_fit": lambda: reconstruct(trained, images, FitOptions("paper")),
+        "image_fit": lambda: reconstruct(trained, images, "paper"),
     }.items():
         with refused(f"baselines/{name}", run=run):
             call()

@@ -9,7 +9,7 @@ from tiny_runs import tiny_baseline
 from torch.testing import assert_close
 
 from sceneprior.apps.config import load_any_run
-from sceneprior.apps.reconstruction.reconstruct import FitOptions, reconstruct
+from sceneprior.apps.reconstruction.reconstruct import reconstruct
 from sceneprior.baselines.single_view.detections import detections_of, some_views
 from sceneprior.baselines.single_view.detector import (
     BIN,
@@ -161,8 +161,8 @@ def test_a_run_answers_each_mask_in_order(baseline_run, toy_shards, method):
     trained = load_any_run(run)
     assert isinstance(trained, TrainedReconstructor) and not trained.remembers_rooms
     images, _ = images_of_split(toy_shards, "test")
-    answers = reconstruct(trained, images, FitOptions())
-    again = reconstruct(load_any_run(run), images[:1], FitOptions())[0]
+    answers = reconstruct(trained, images)
+    again = reconstruct(load_any_run(run), images[:1])[0]
     assert again.scene.objects[0].center_m == pytest.approx(
         answers[0].scene.objects[0].center_m, abs=1e-4
     )

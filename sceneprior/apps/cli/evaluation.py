@@ -181,7 +181,6 @@ def eval_svr(
     seed: options.Seed = 0,
 ) -> None:
     """Evaluate single-view reconstruction, with training rooms as baselines."""
-    from sceneprior.apps.reconstruction.reconstruct import FitOptions
     from sceneprior.apps.reconstruction.score import (
         evaluate_run,
         evaluate_scenes,
@@ -190,9 +189,8 @@ def eval_svr(
     from sceneprior.core.files import write_json
 
     if run is not None and scenes is None:
-        chosen = FitOptions(fit, restarts)
         target = options.result_file(run, out, "svr.json")
-        found = evaluate_run(run, shards, chosen, split, seed, views, limit, models)
+        found = evaluate_run(run, shards, fit, restarts, split, seed, views, limit, models)
     elif scenes is not None and run is None:
         given = (views, limit, fit, restarts, models)
         if given != (1, None, "objects", 1, None):

@@ -234,7 +234,19 @@ def read_intrinsics(text: str, image_size: tuple[int, int]) -> np.ndarray:
                     f"{width} x {height}; scale fx, fy, cx and cy, or the mask."
                 )
         elif text.startswith(("fov=", "35mm=")):
-            focal = _focal_px(text, image_size)
+            kind, _, number = text.partition("=")
+            value = float(number)
+            if kind == "35mm":
+                focal = value * math.hypot(*image_size) / FILM_DIAGONAL_MM
+            elif 0 < value < math.pi:
+                raise InputError(
+                    f"--intrinsics {text}: no camera has so small a field of view. If {number} is "
+                    f"in radians, give degrees: fov={math.degrees(value):.3g}."
+                )
+            elif 0 < value < 180:
+                focal = width / 2 / math.tan(math.radians(value) / 2)
+            else:
+                raise ValueError("no field of view")
             data = {"fx": focal, "fy": focal, "cx": width / 2, "cy": height / 2}
         else:
             data = dict(zip(("fx", "fy", "cx", "cy"), map(float, text.split(",")), strict=True))
@@ -269,21 +281,6 @@ def read_intrinsics(text: str, image_size: tuple[int, int]) -> np.ndarray:
             "image of another size. Scale the intrinsics, or the mask."
         )
     return matrix
-
-
-def _focal_px(text: str, image_size: tuple[int, int]) -> float:
-    kind, _, number = text.partition("=")
-    if kind == "35mm":
-        return float(number) * math.hypot(*image_size) / FILM_DIAGONAL_MM
-    angle = float(number)
-    if 0 < angle < math.pi:
-        raise InputError(
-            f"--intrinsics {text}: no camera has so small a field of view. If {number} is in "
-            f"radians, give degrees: fov={math.degrees(angle):.3g}."
-        )
-    if not 0 < angle < 180:
-        raise ValueError("no field of view")
-    return image_size[1] / 2 / math.tan(math.radians(angle) / 2)
 
 
 def read_pose(path: Path) -> np.ndarray:

@@ -57,20 +57,6 @@ SIGHT_M = 0.8
 
 
 @dataclass(frozen=True)
-class FitOptions:
-    """Options of a reconstruction."""
-
-    fit: str = OBJECTS
-    """`objects` fits object by object; a name of `SCHEDULES` fits one latent per image."""
-    restarts: int = 1
-    """Number of latents fitted to each image, started at the nearest training rooms; the latent
-    with the lowest score is kept."""
-    masks: bool = True
-    """Also fit latents to masks. False uses only classes and 2D boxes, as is always done if shapes
-    are posed prototypes rather than meshes."""
-
-
-@dataclass(frozen=True)
 class Reconstruction:
     """The 3D reconstruction of one image."""
 
@@ -90,27 +76,38 @@ class Reconstruction:
 
 
 def reconstruct(
-    trained: Trained, images: Sequence[ObservedImage], options: FitOptions
+    trained: Trained,
+    images: Sequence[ObservedImage],
+    fit: str = OBJECTS,
+    restarts: int = 1,
+    masks: bool = True,
 ) -> list[Reconstruction]:
     """Reconstruct images of the run's label set, in batches.
 
     Scenes have no meshes if the run's shape stage has not been trained. A baseline that predicts
     objects from images directly is used without a fit.
+
+    Args:
+        fit: `objects` fits object by object; a name of `SCHEDULES` fits one latent per image.
+        restarts: Number of latents fitted to each image, started at the nearest training rooms; the
+            latent with the lowest score is kept.
+        masks: Also fit latents to masks. False uses only classes and 2D boxes, as is always done if
+            shapes are posed prototypes rather than meshes.
     """
-    if options.fit not in (OBJECTS, *SCHEDULES):
+    if fit not in (OBJECTS, *SCHEDULES):
         raise InputError(
-            f"No fit is called '{options.fit}'; choose from {', '.join((OBJECTS, *SCHEDULES))}."
+            f"No fit is called '{fit}'; choose from {', '.join((OBJECTS, *SCHEDULES))}."
         )
-    if options.restarts < 1:
-        raise InputError(f"restarts is {options.restarts}; an image needs at least one.")
-    if options.restarts > 1 and options.fit == OBJECTS:
+    if restarts < 1:
+        raise InputError(f"restarts is {restarts}; an image needs at least one.")
+    if restarts > 1 and fit == OBJECTS:
         raise InputError("restarts apply only to the fit `paper`, which fits latents; name it.")
     if not isinstance(trained, TrainedReconstructor):
         with_training_latents(trained, "Reconstruction")
-    elif options.fit != OBJECTS:
+    elif fit != OBJECTS:
         raise InputError(
             f"A run of `method: {trained.config.method}` has no latents to fit; leave out the fit "
-            f"{options.fit}."
+            f"{fit}."
         )
     for image in images:
         if image.label_set != trained.config.label_set:
@@ -120,7 +117,7 @@ def reconstruct(
             )
     if not images:
         return []
-    if isinstance(trained, TrainedPrior) and options.fit == OBJECTS:
+    if isinstance(trained, TrainedPrior) and fit == OBJECTS:
         return [
             Reconstruction(image, answer.scene, answer.energy, taken_for=answer.taken_for)
             for image, answer in zip(images, answer_images(trained, images), strict=True)
@@ -129,7 +126,7 @@ def reconstruct(
     by_size: dict[tuple[int, ...], list[int]] = defaultdict(list)
     for row in sorted(range(len(images)), key=lambda row: len(images[row].object_class)):
         by_size[images[row].instance_ids.shape].append(row)
-    most = max(BATCH // options.restarts, 1)
+    most = max(BATCH // restarts, 1)
     found: dict[int, Reconstruction] = {}
     for size in by_size.values():
         for rows in (size[at : at + most] for at in range(0, len(size), most)):
@@ -138,7 +135,7 @@ def reconstruct(
                 answers = _found_directly(trained, part)
             else:
                 assert isinstance(trained, TrainedPrior), "checked above: it remembers rooms"
-                answers = _fitted(trained, part, options)
+                answers = _fitted(trained, part, fit, restarts, masks)
             found |= zip(rows, answers, strict=True)
     return [found[row] for row in range(len(images))]
 
@@ -169,32 +166,32 @@ def _found_directly(
 
 
 def _fitted(
-    trained: TrainedPrior, images: Sequence[ObservedImage], options: FitOptions
+    trained: TrainedPrior, images: Sequence[ObservedImage], fit: str, restarts: int, masks: bool
 ) -> list[Reconstruction]:
     """Latents fitted to images of one size, from the training rooms with the lowest layout losses
     on each."""
     views, labels = as_views(images, trained.config.data.mask_step), trained.config.label_set
     refuse_crowds(trained, views)
-    if options.restarts > len(trained.logits):
+    if restarts > len(trained.logits):
         raise InputError(
-            f"{options.restarts} restarts need as many training rooms, but the run has "
+            f"{restarts} restarts need as many training rooms, but the run has "
             f"{len(trained.logits)}; use fewer restarts."
         )
     losses = layout_losses_of_rooms(trained, views)
-    nearest = losses.topk(options.restarts, dim=1, largest=False).indices
+    nearest = losses.topk(restarts, dim=1, largest=False).indices
     starts = trained.prior.latent_space(trained.logits)[nearest]
-    repeated = rows_of(views, torch.arange(len(images)).repeat_interleave(options.restarts))
-    schedule = SCHEDULES[options.fit]
-    fit = fit_latents_to_images(trained, repeated, starts.flatten(0, 1), schedule, options.masks)
-    compared = options.masks and fit.scenes.vertices_m is not None
-    best = fit.loss.score.reshape(len(images), -1).argmin(dim=1)
-    rows = best + options.restarts * torch.arange(len(images))
+    repeated = rows_of(views, torch.arange(len(images)).repeat_interleave(restarts))
+    given = (starts.flatten(0, 1), SCHEDULES[fit], masks)
+    found = fit_latents_to_images(trained, repeated, *given)
+    compared = masks and found.scenes.vertices_m is not None
+    best = found.loss.score.reshape(len(images), -1).argmin(dim=1)
+    rows = best + restarts * torch.arange(len(images))
     answers = []
     for image, row in zip(images, rows.tolist(), strict=True):
-        predictions = fit.loss.matches.prediction[row, : len(image.object_class)].tolist()
-        scene = scene_of(fit.scenes, row, predictions, trained.prior, labels, image.name)
-        mask_iou = float(fit.loss.mask_iou[row]) if compared else None
-        score, steps = float(fit.loss.score[row]), int(fit.steps[row])
+        predictions = found.loss.matches.prediction[row, : len(image.object_class)].tolist()
+        scene = scene_of(found.scenes, row, predictions, trained.prior, labels, image.name)
+        mask_iou = float(found.loss.mask_iou[row]) if compared else None
+        score, steps = float(found.loss.score[row]), int(found.steps[row])
         answers.append(Reconstruction(image, scene, score, mask_iou, steps))
     return answers
 

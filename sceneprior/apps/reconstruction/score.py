@@ -3,7 +3,6 @@
 import time
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import numpy as np
 from rich.table import Table
 
 from sceneprior.apps.config import load_any_run
-from sceneprior.apps.reconstruction.reconstruct import FitOptions, reconstruct
+from sceneprior.apps.reconstruction.reconstruct import reconstruct
 from sceneprior.apps.retrieval.cad_models import open_models
 from sceneprior.apps.retrieval.retrieve import retrieve_all
 from sceneprior.core.errors import InputError
@@ -56,7 +55,8 @@ Answers = Sequence[Sequence[SceneObject | None]]
 def evaluate_run(
     run: str,
     shards: Path,
-    options: FitOptions,
+    fit: str,
+    restarts: int,
     split: str,
     seed: int,
     count: int,
@@ -77,7 +77,7 @@ def evaluate_run(
     reference_scenes(shards, split, limit=1, meshes=False)  # raises before any fit
     images, blank = images_of_split(shards, split, seed, limit, count)
     begin = time.process_time()
-    fitted = reconstruct(trained, images, options)
+    fitted = reconstruct(trained, images, fit, restarts)
     seconds = time.process_time() - begin
     answers: dict[str, Answers] = {
         "fit": [one.scene.objects for one in fitted],
@@ -89,7 +89,7 @@ def evaluate_run(
         answers["fit_cad"] = [scene.objects for scene in retrieved]
     overlaps = [one.mask_iou for one in fitted if one.mask_iou is not None]
     if overlaps:
-        plain = reconstruct(trained, images, replace(options, masks=False))
+        plain = reconstruct(trained, images, fit, restarts, masks=False)
         answers["layout_fit"] = [one.scene.without_meshes().objects for one in plain]
     protocol = {
         "run": Path(run).resolve().name,
@@ -97,7 +97,7 @@ def evaluate_run(
         "views": "drawn at random from those that show an object",
         "views_per_room": count,
         "rooms_without_such_a_view": blank,
-        "fit": asdict(options),
+        "fit": {"fit": fit, "restarts": restarts, "masks": True},
         "models": None if models is None else Path(models).resolve().name,
     }
     more = {

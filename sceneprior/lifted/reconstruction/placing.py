@@ -118,18 +118,6 @@ def projected_extents(
     return extents, moved, (seen[..., 2] < NEAR_M).to(depth).mean(dim=1)
 
 
-def beyond(
-    extents: Float[Tensor, "objects 8"], observed: Outlines
-) -> tuple[Float[Tensor, "objects 8"], Float[Tensor, "objects 8"]]:
-    """Signed distances by which objects extend beyond their masks, and the weights of these
-    distances. Objects are clipped at the image's sides and corners, as masks are."""
-    directions = extents.new_tensor(DIRECTIONS)
-    border = directions.clamp(min=0).sum(dim=1)
-    apart = extents.minimum(border) - observed.extents
-    slack = torch.where((apart > 0) & ~observed.clear, OCCLUSION_SLACK, 1.0)
-    return apart, slack
-
-
 class Placed(NamedTuple):
     """Objects placed where they fit their masks best."""
 
@@ -156,10 +144,13 @@ def place_objects(
     place_m = starting_places(heights_m, masks)
     best, energy = place_m, torch.full_like(heights_m, torch.inf)
     held = DAMPING * torch.eye(2)
+    border = points.new_tensor(DIRECTIONS).clamp(min=0).sum(dim=1)
     for step in range(STEPS + 1):
         centers_m = torch.stack([place_m[:, 0], heights_m, place_m[:, 1]], dim=-1)
         extents, slope, behind = projected_extents(shape_m + centers_m[:, None], masks)
-        apart, slack = beyond(extents, masks)
+        # Signed distances beyond the masks, clipped at the image's sides and corners as masks are.
+        apart = extents.minimum(border) - masks.extents
+        slack = torch.where((apart > 0) & ~masks.clear, OCCLUSION_SLACK, 1.0)
         cost = (slack * apart.abs()).sum(dim=1) / SPREAD + BEHIND * behind
         better = cost < energy
         best, energy = torch.where(better[:, None], place_m, best), cost.minimum(energy)

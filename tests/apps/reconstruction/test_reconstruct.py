@@ -10,7 +10,6 @@ from torch.testing import assert_close
 
 from sceneprior.apps.reconstruction import reconstruct as reconstruct_module
 from sceneprior.apps.reconstruction.reconstruct import (
-    FitOptions,
     layout_losses_of_rooms,
     reconstruct,
 )
@@ -25,7 +24,7 @@ def short(monkeypatch):
 
 
 def test_objects_answer_for_masks_in_their_order(trained, images):
-    found = reconstruct(trained, images, FitOptions("short"))
+    found = reconstruct(trained, images, "short")
     assert [one.image.name for one in found] == [image.name for image in images]
     for one in found:
         assert len(one.scene.objects) == len(one.image.rows)
@@ -45,7 +44,7 @@ def test_grids_are_fitted_by_classes_and_boxes_alone(grid_prior, images, monkeyp
         return decode(z, with_shape, wanted)
 
     monkeypatch.setattr(grid_prior.prior, "decode", counted)
-    found = reconstruct(grid_prior, images[:2], FitOptions("short"))
+    found = reconstruct(grid_prior, images[:2], "short")
     assert decoded[-1] and not any(decoded[:-1]) and len(decoded) > 10
     for one in found:
         assert one.mask_iou is None and len(one.scene.objects) == len(one.image.rows)
@@ -62,14 +61,14 @@ def test_images_of_any_size_and_number_come_back_in_their_order(trained, images,
     )
     monkeypatch.setattr(reconstruct_module, "BATCH", 2)
     given = [images[3], half, images[0], images[2]]
-    found = reconstruct(trained, given, FitOptions("short"))
+    found = reconstruct(trained, given, "short")
     assert [one.image is image for one, image in zip(found, given, strict=True)] == [True] * 4
-    alone = reconstruct(trained, [images[0]], FitOptions("short"))[0]
+    alone = reconstruct(trained, [images[0]], "short")[0]
     assert found[2].score == pytest.approx(alone.score, rel=1e-3)
 
 
 def test_more_restarts_are_never_worse_and_the_best_is_kept(trained, images):
-    one, three = (reconstruct(trained, images, FitOptions("short", restarts=n)) for n in (1, 3))
+    one, three = (reconstruct(trained, images, "short", restarts=n) for n in (1, 3))
     # The first start is the same; sums in another order may move its score a little.
     assert all(b.score <= a.score + 1e-3 for a, b in zip(one, three, strict=True))
     assert any(b.score < a.score - 1e-3 for a, b in zip(one, three, strict=True))
@@ -78,14 +77,14 @@ def test_more_restarts_are_never_worse_and_the_best_is_kept(trained, images):
 def test_options_and_images_that_cannot_be(trained, images):
     other = replace(images[0], label_set="scannet")
     for name, some, options in (
-        ("fit", images, FitOptions("long")),
-        ("restarts_of_objects", images, FitOptions(restarts=2)),
-        ("no_restarts", images, FitOptions(restarts=0)),
-        ("label_set", [other], FitOptions("short")),
-        ("restarts", images, FitOptions("short", restarts=13)),
+        ("fit", images, dict(fit="long")),
+        ("restarts_of_objects", images, dict(restarts=2)),
+        ("no_restarts", images, dict(restarts=0)),
+        ("label_set", [other], dict(fit="short")),
+        ("restarts", images, dict(fit="short", restarts=13)),
     ):
         with refused(f"apps/reconstruct_{name}"):
-            reconstruct(trained, some, options)
+            reconstruct(trained, some, **options)
 
 
 def test_an_object_of_a_class_that_the_run_never_generates(trained, images):
@@ -98,7 +97,7 @@ def test_an_object_of_a_class_that_the_run_never_generates(trained, images):
     classes = images[0].object_class.copy()
     classes[0] = names.index("sofa")
     other = replace(images[0], object_class=classes)
-    plain, one = reconstruct(trained, [images[0], other], FitOptions())
+    plain, one = reconstruct(trained, [images[0], other])
     assert [item.label for item in one.scene.objects] == [names[index] for index in classes]
     assert set(one.taken_for) - set(plain.taken_for) == {"sofa"}
     assert one.taken_for["sofa"] in generated
