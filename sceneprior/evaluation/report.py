@@ -63,8 +63,8 @@ def write_report(
         source: Origin of the rooms, such as `run bedrooms`.
         made_by: Description of the method that made the rooms, and of the method's random inputs.
         shards: Input views come from `train`, real rooms from `test` if known in 3D.
-        scores: From `evaluate_synthesis`; class_accuracy, box_iou_3d, seconds and
-            peak_memory_gib are shown too if present.
+        scores: From `evaluate_synthesis`; class_accuracy, box_iou_3d and seconds are shown too if
+            present.
         views: Show the input views of training, for a method that learns from them.
         curves: Points (epoch, value) by name; one panel each.
         decoded: (decoded, true) training rooms.
@@ -174,9 +174,7 @@ def _tiles(scores: dict[str, Any]) -> list[tuple[str, str, str]]:
         if scores.get(key) is not None
     ]
     if "seconds" in scores:
-        memory = scores.get("peak_memory_gib")
-        beside = "" if memory is None else f"{memory:.1f} GiB of memory at most"
-        tiles.append((f"{scores['seconds'] / 60:.1f} min", "from homes to scores", beside))
+        tiles.append((f"{scores['seconds'] / 60:.1f} min", "for the commands below", ""))
     return tiles
 
 

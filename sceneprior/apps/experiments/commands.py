@@ -9,7 +9,6 @@ import contextlib
 import gc
 import importlib
 import os
-import resource
 import shlex
 import signal
 import sys
@@ -93,12 +92,9 @@ def run_command(main: Main, command: Command, folder: Path, log: Path | None = N
         finished = True
     finally:
         end = costs()
-        for name in ("cpu_s", "wall_s"):
+        for name, before in start.items():
             known = took.get(name) is not None
-            entry[name] = took[name] + end[name] - start[name] if known else None
-        if log is None:  # the peak of all commands so far: of a whole, not of one run among others
-            before = took.get("peak_memory_gib") or 0.0
-            entry["peak_memory_gib"] = max(before, end["peak_memory_gib"])
+            entry[name] = took[name] + end[name] - before if known else None
         entry["finished"] = finished
         write_json(folder / "steps.json", {**earlier, command.name: entry})
 
@@ -131,14 +127,10 @@ def call(main: Main, arguments: list[str], log: Path | None) -> None:
 
 
 def costs() -> dict[str, float]:
-    """CPU and wall-clock seconds so far, and the memory of the largest process so far."""
+    """CPU and wall-clock seconds so far."""
     used = os.times()
-    peaks = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
-    return {
-        "cpu_s": used.user + used.system + used.children_user + used.children_system,
-        "wall_s": time.monotonic(),
-        "peak_memory_gib": max(resource.getrusage(who).ru_maxrss for who in peaks) / 2**20,
-    }
+    cpu_s = used.user + used.system + used.children_user + used.children_system
+    return {"cpu_s": cpu_s, "wall_s": time.monotonic()}
 
 
 def read_journal(folder: Path) -> dict[str, Any]:
@@ -157,19 +149,21 @@ def read_result(path: Path) -> dict[str, Any]:
         ) from None
 
 
-def finished_commands(folder: Path) -> list[str]:
-    """The finished commands of `steps.json`, as they are typed."""
-    journal = read_journal(folder).values()
-    return [
-        f"sceneprior {shlex.join(entry['arguments'])}" for entry in journal if entry.get("finished")
-    ]
+def finished_commands(folder: Path) -> tuple[list[str], float | None]:
+    """The finished commands of `steps.json`, as they are typed, and the seconds that they took;
+    None if one was killed, or nothing has run."""
+    finished = [entry for entry in read_journal(folder).values() if entry.get("finished")]
+    seconds = [entry["wall_s"] for entry in finished]
+    known = seconds and None not in seconds
+    typed = [f"sceneprior {shlex.join(entry['arguments'])}" for entry in finished]
+    return typed, sum(seconds) if known else None
 
 
 # -- The demo --------------------------------------------------------------------------------------
 
 
 def run_demo(out: Path, config: str, rooms: int, count: int, main: Main) -> None:
-    """Run every unfinished command, then add time and memory to the scores.
+    """Run every unfinished command.
 
     Ctrl-C, SIGTERM and SIGHUP raise KeyboardInterrupt; a second, identical call continues.
     """
@@ -180,15 +174,12 @@ def run_demo(out: Path, config: str, rooms: int, count: int, main: Main) -> None
                 seconds = "" if took is None else f", {took:.0f} s"
                 print(f"{command.name}: done before{seconds}", file=sys.stderr)
                 continue
-            if command.name == "report":
-                _add_costs(out)
             try:
                 run_command(main, command, out)
             except InputError:
                 raise InputError(
                     f"The demo stopped at '{command.name}'; fix the error and run it again."
                 ) from None
-        _add_costs(out)
 
 
 def demo_commands(out: Path, config: str, rooms: int, count: int) -> list[Command]:
@@ -222,15 +213,3 @@ def demo_commands(out: Path, config: str, rooms: int, count: int) -> list[Comman
         Command(name, arguments, out / results[name], depends_on[name], continues.get(name))
         for name, arguments in words.items()
     ]
-
-
-def _add_costs(out: Path) -> None:
-    """Add the time and memory of all commands to scores.json, unless one was killed."""
-    noted = {name: entry for name, entry in read_journal(out).items() if entry.get("finished")}
-    scores = read_result(out / "scores.json")
-    seconds = {name: entry["wall_s"] for name, entry in noted.items()}
-    if None not in seconds.values():
-        scores["seconds"] = round(sum(seconds.values()), 1)
-        scores["peak_memory_gib"] = round(max(e["peak_memory_gib"] for e in noted.values()), 2)
-        scores["steps"] = {name: round(took, 1) for name, took in seconds.items()}
-    write_json(out / "scores.json", scores)

@@ -32,11 +32,12 @@ CURVES = (
 def report_run(run: Path, scores: Path | None, out: Path, seed: int) -> None:
     """Write the report page of a run, without comparisons if the rooms have no 3D ground truth.
 
-    The page lists the commands recorded beside the run, as those of the demo are.
+    The page lists the commands recorded beside the run, as those of the demo are, and their time.
     """
     trained = load_any_run(run)
     config, shards = trained.config, Path(trained.config.data.shards)
     found, in_3d = read_scores(scores, run, shards, f"--run {run}"), known_in_3d(shards, "train")
+    commands, seconds = finished_commands(run.parent)
     keeping = trained if isinstance(trained, TrainedPrior) and trained.remembers_rooms else None
     method = made_by_run(config, trained.distribution)[0] or f"the method {config.method}"
     made_by = f"{method}, which learns from {config.learns_from}"
@@ -50,8 +51,8 @@ def report_run(run: Path, scores: Path | None, out: Path, seed: int) -> None:
         shards=shards,
         views=not isinstance(trained, TrainedSampler),
         generated=sample_rooms(trained, ROOMS_SHOWN, seed),
-        scores=found,
-        commands=finished_commands(run.parent),
+        scores=found if seconds is None else found | {"seconds": seconds},
+        commands=commands,
         curves=read_curves(run),
         decoded=decoded_and_true(keeping, shards, meshes=True) if keeping and in_3d else [],
         unfolding=unfold(keeping) if keeping else [],
