@@ -281,7 +281,9 @@ class _RoomReader:
         house."""
         for entry in entries:
             model_id, said = str(entry.get("jid") or ""), entry.get("category")
-            if not self.models.has(model_id):
-                of_house = isinstance(said, str) and said.strip()
-                unlisted = of_house and not self.models.lists(model_id)
-                yield model_id, tidy_category(said) if unlisted else self.models.category(model_id)
+            if self.models.has(model_id):
+                continue
+            if not self.models.lists(model_id) and isinstance(said, str) and said.strip():
+                yield model_id, tidy_category(said)
+            else:
+                yield model_id, self.models.category(model_id)

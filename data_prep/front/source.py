@@ -64,13 +64,11 @@ class FrontSource:
         model_categories(Path(self.future))  # reports a bad list here, not once per house
         if self.splits is not None:
             read_splits(self.splits)
+        recipe = self.recipe.model_dump()
+        for key in ("invalid_rooms", "invalid_models"):  # hashed, as there may be thousands
+            recipe[key] = digest("\n".join(recipe[key])) if recipe[key] else None
         return {
-            "recipe": {
-                **self.recipe.model_dump(),
-                # The ids are hashed, because there may be thousands.
-                "invalid_rooms": _digest_of_ids(self.recipe.invalid_rooms),
-                "invalid_models": _digest_of_ids(self.recipe.invalid_models),
-            },
+            "recipe": recipe,
             "seed": self.seed,
             "splits": None if self.splits is None else digest(Path(self.splits).read_text()),
             "houses": digest_of_files(self._houses(only)),
@@ -157,10 +155,6 @@ class FrontSource:
                 f"{self.front} has no house '{house}' (--only takes HOUSE, HOUSE/ROOM or ID).{room}"
             )
         return chosen
-
-
-def _digest_of_ids(ids: tuple[str, ...]) -> str | None:
-    return digest("\n".join(ids)) if ids else None
 
 
 # Models and houses are cached from room to room within a process. The stamps make workers that

@@ -161,21 +161,6 @@ def boxes_around(hull: Hull, world_to_camera: np.ndarray, intrinsics: np.ndarray
     return np.concatenate(boxes, axis=1)
 
 
-def box_iou_2d(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Intersection over union of 2D boxes, row by row; NaN if a box is NaN or both are empty.
-
-    Example: two squares that overlap by one half.
-
-        >>> box_iou_2d(np.array([[0.0, 0, 2, 2]]), np.array([[1.0, 0, 3, 2]])).round(3).tolist()
-        [0.333]
-    """
-    low, high = np.maximum(a[..., :2], b[..., :2]), np.minimum(a[..., 2:], b[..., 2:])
-    shared = np.maximum(high - low, 0).prod(axis=-1)
-    areas = [(box[..., 2:] - box[..., :2]).prod(axis=-1) for box in (a, b)]
-    union = np.asarray(areas[0] + areas[1] - shared)
-    return np.divide(shared, union, out=np.full(union.shape, np.nan), where=union > 0)
-
-
 class Limits(NamedTuple):
     """Minima of agreement: a share of the general ones, where at least so many masks count."""
 
@@ -258,7 +243,7 @@ class Comparison(NamedTuple):
             if judged.any():
                 held, whole = self.held & judged, self.whole & judged
                 counts = (int(flags.sum()) for flags in (judged, held, whole))
-                tallies[kind] = Tally(kind, *counts, float(self.iou[whole].sum()))
+                tallies[kind] = Tally._make((kind, *counts, float(self.iou[whole].sum())))
         return tallies
 
 
@@ -267,7 +252,8 @@ def compare(room: Room) -> Comparison:
     views = room.views
     masks = views.boxes * np.tile(room.size_px, 2)
     boxes = np.full(masks.shape, np.nan)
-    judged, whole = views.visible.copy(), own_sides(views, views.image_size).all(axis=-1)
+    judged = views.visible.copy()
+    whole = np.asarray(own_sides(views, views.image_size).all(axis=-1))
     for k, body in enumerate(room.bodies):
         if body is None:
             judged[:, k] = False
@@ -277,6 +263,13 @@ def compare(room: Room) -> Comparison:
     margin = MARGIN * max(views.image_size)
     # Comparisons with NaN (behind the camera) are false: undefined projections disagree.
     begins = (boxes[..., :2] <= masks[..., :2] + margin).all(axis=-1)
-    held = begins & (boxes[..., 2:] >= masks[..., 2:] - margin).all(axis=-1)
+    held = np.logical_and(begins, (boxes[..., 2:] >= masks[..., 2:] - margin).all(axis=-1))
+    low, high = (
+        np.maximum(boxes[..., :2], masks[..., :2]),
+        np.minimum(boxes[..., 2:], masks[..., 2:]),
+    )
+    shared = np.maximum(high - low, 0).prod(axis=-1)
+    union = sum((box[..., 2:] - box[..., :2]).prod(axis=-1) for box in (boxes, masks)) - shared
+    iou = np.divide(shared, union, out=np.zeros_like(shared), where=union > 0)
     kinds = tuple(body.kind if body else "" for body in room.bodies)
-    return Comparison(kinds, judged, held, whole, np.nan_to_num(box_iou_2d(boxes, masks)))
+    return Comparison(kinds, judged, held, whole, iou)

@@ -115,12 +115,12 @@ def _tracked_better(rooms: Iterable[RoomViews]) -> str:
     sums = np.zeros((2, 2))
     for views in rooms:
         for row, of_ids in enumerate((views, _retracked(views))):
-            found = middles(of_ids)
+            seen = middles(of_ids)
             poses, lenses = (
                 array[None].astype(np.float64)
                 for array in (views.world_to_camera, views.intrinsics)
             )
-            sums[row] += float(fit(found, poses, lenses)[0].sum()), len(found.item)
+            sums[row] += float(fit(seen, poses, lenses)[0].sum()), len(seen.item)
     (given, of_given), (found, of_found) = sums.tolist()
     # With right poses and wrong ids, most masks join others; with wrong poses, hardly any do.
     if found > _GOOD * of_found and found > _GAIN * given and 2 * found > of_given:
@@ -236,8 +236,11 @@ def what_was_checked(evidence: Evidence) -> tuple[list[str], list[str]]:
     }
     yes, no = ([name for name in kinds if kinds[name] is found] for found in (True, False))
     for step in sorted({abs(step) for step in FOCAL_STEPS}):
-        least = (step - 0.5) / 6
-        if excluded("focal", lambda cause, least=least: abs(np.log2(cause.detail)) > least):
+
+        def far(cause: Cause, least: float = (step - 0.5) / 6) -> bool:
+            return bool(abs(np.log2(cause.detail)) > least)
+
+        if excluded("focal", far):
             yes.append(f"focal lengths {2 ** (step / 6):.2g} times as long or as short")
             break
     else:

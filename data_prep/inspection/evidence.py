@@ -120,7 +120,7 @@ def total(rooms: list[Evidence]) -> Evidence:
     counts = ("rooms", "middles", "spare", "views", "ids", "masks", "once")
     x, y, z = np.mean([room.tops for room in rooms], axis=0).tolist()
     nearness, lengths, floors = known("nearness"), known("length_m"), known("floor_m")
-    level = float(np.median(floors)) if floors else None
+    level = float(np.median(floors)) if floors else 0.0
     same = sum(abs(floor - level) < _SAME_FLOOR_M for floor in floors)
     agreed = same >= min(len(rooms), 2) and 3 * same >= 2 * len(floors)
     return Evidence(
@@ -130,7 +130,7 @@ def total(rooms: list[Evidence]) -> Evidence:
         tops=(x, y, z),
         eye_m=float(np.median(known("eye_m"))),
         length_m=float(np.median(lengths)) if lengths else None,
-        floor_m=level if agreed else None,
+        floor_m=level if floors and agreed else None,
     )
 
 

@@ -143,9 +143,10 @@ def draw_view(
     for name, end in zip(AXES, np.eye(3) * _AXIS_M, strict=True):
         for line in project(np.stack([np.zeros(3), end]), [(0, 1)]):
             draw.line(line, fill=AXES[name], width=2)
-            draw.text(line[2:], name, fill=AXES[name], font=_font(12), anchor="mm")
-    seen = np.flatnonzero(room.visible[view])
+            draw.text((line[2], line[3]), name, fill=AXES[name], font=_font(12), anchor="mm")
+    seen = np.flatnonzero(room.visible[view]).tolist()
     for k in [] if truth is None else seen:
+        assert truth is not None
         corners_m = box_corners(truth.centers_m[k], truth.sizes_m[k])
         wires(corners_m, BOX_EDGES, (255, 255, 255), 3)
         wires(corners_m, BOX_EDGES, (0, 0, 0))
@@ -195,9 +196,10 @@ def draw_plan(shard: Shard, room_id: str) -> Image.Image:
             label = names[int(truth.object_class[k])]
             _tag(draw, (corner[0] + 2, corner[1] + 2), label, _dark(color))
     if has_stuff:
-        for lines, color in zip(find_walls(room), (WALL, DOOR), strict=True):
-            for line in lines:
-                draw.line((*at(*line.start_m), *at(*line.end_m)), fill=color, width=4)
+        walls, doors = find_walls(room)
+        ends = [(wall.start_m, wall.end_m, WALL) for wall in walls]
+        for start, end, color in ends + [(door.start_m, door.end_m, DOOR) for door in doors]:
+            draw.line((*at(*start), *at(*end)), fill=color, width=4)
     for matrix in room.world_to_camera.astype(np.float64):
         eye = camera_centers(matrix)
         u, v = at(eye[0], eye[2])

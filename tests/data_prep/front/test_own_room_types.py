@@ -69,7 +69,7 @@ def kitchen_job(front: FrontFolder, out: Path, **changes: object) -> Job:
     return Job(FrontSource(front.front, front.future, recipe), out, renderer="software")
 
 
-def test_categories_get_the_classes_of_the_users_recipe(tmp_path):
+def test_categories_and_models_get_the_classes_of_the_users_recipe(tmp_path):
     front = write_kitchens(tmp_path, houses=2)
     summary = build_shards(kitchen_job(front, tmp_path / "mine"))
     index = read_index(tmp_path / "mine")
@@ -92,18 +92,6 @@ def test_categories_get_the_classes_of_the_users_recipe(tmp_path):
     assert set(quiet.report["unknown_categories"]) == {
         "refrigerator/freezer", "gas stove", "base cabinet",
     }  # fmt: skip
-
-
-def test_a_recipe_whose_categories_do_not_fit_says_which_there_are(tmp_path):
-    front = write_kitchens(tmp_path, houses=1)
-    job = kitchen_job(front, tmp_path / "mine", label_set=["oven", "hood"], categories={})
-    with pytest.raises(InputError, match=r"0 objects, min_objects is 3 \(of no class: .*gas stove"):
-        build_shards(job)
-
-
-def test_the_models_of_shards_have_the_classes_of_their_recipe(tmp_path):
-    front = write_kitchens(tmp_path, houses=2)
-    build_shards(kitchen_job(front, tmp_path / "mine"))
     models = open_models(tmp_path / "mine", LABEL_SET, tmp_path / "cache")
     found = {label: models.of_class(label) for label in label_set(LABEL_SET)}
     assert {label: some.model_ids for label, some in found.items() if some} == {
@@ -119,6 +107,13 @@ def test_the_models_of_shards_have_the_classes_of_their_recipe(tmp_path):
     (tmp_path / "spoilt" / "models" / "hob.ply").write_bytes(b"ply")
     damaged = open_models(tmp_path / "spoilt", LABEL_SET, tmp_path / "cache")
     assert "is not a triangle mesh" in damaged.broken["hob"]
+
+
+def test_a_recipe_whose_categories_do_not_fit_says_which_there_are(tmp_path):
+    front = write_kitchens(tmp_path, houses=1)
+    job = kitchen_job(front, tmp_path / "mine", label_set=["oven", "hood"], categories={})
+    with pytest.raises(InputError, match=r"0 objects, min_objects is 3 \(of no class: .*gas stove"):
+        build_shards(job)
 
 
 @pytest.mark.slow
