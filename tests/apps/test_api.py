@@ -8,8 +8,7 @@ import torch
 
 import sceneprior
 from sceneprior.core.errors import InputError
-from sceneprior.core.scene import Mesh, Scene, SceneObject
-from sceneprior.render.scene_files import save
+from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.render.topdown import html_of, show
 
 BED = SceneObject("double_bed", (0.2, 0.3, -0.9), (1.7, 0.6, 2.1))
@@ -38,32 +37,6 @@ def test_a_way_leads_from_room_to_room(prior):
         prior.interpolate(Scene("drawn", "front3d_bedroom"), end)
     with pytest.raises(InputError, match=r"The vector has a latent of shape \(3,\)"):
         prior.latent(torch.ones(3))
-
-
-@pytest.mark.parametrize("ending", ["json", "glb", "obj", "png"])
-def test_a_scene_is_saved_as_its_name_says(ending, tmp_path):
-    room = Scene("mine", "front3d_bedroom", (BED,))
-    save(room, tmp_path / f"room.{ending}")
-    starts = {"json": b"{", "glb": b"glTF", "obj": b"mtllib room.mtl", "png": b"\x89PNG"}
-    assert (tmp_path / f"room.{ending}").read_bytes().startswith(starts[ending])
-    if ending == "json":
-        assert sceneprior.load_scene(tmp_path / "room.json") == room
-
-
-def test_other_endings_are_a_sentence(tmp_path):
-    with pytest.raises(InputError, match=r"ends with '.stl', which is not a scene format"):
-        save(Scene("mine", "front3d_bedroom"), tmp_path / "room.stl")
-
-
-def test_a_printed_room_is_one_line():
-    mesh = Mesh(np.zeros((4, 3)), np.zeros((2, 3), dtype=np.int64))
-    lamp = SceneObject("pendant_lamp", (0.0, 2.0, 0.0), (1.0, 1.0, 1.0), mesh, solids=(mesh,) * 9)
-    room = Scene("mine", "front3d_bedroom", (lamp, BED, BED), np.zeros((50, 2)), {"seed": 1})
-    assert repr(room) == "Scene('mine', front3d_bedroom: double_bed ×2, pendant_lamp)"
-    assert repr(lamp) == (
-        "SceneObject(label='pendant_lamp', center_m=(0.0, 2.0, 0.0), size_m=(1.0, 1.0, 1.0), "
-        "mesh=Mesh(4 vertices, 2 faces), turned=None)"
-    )
 
 
 def test_a_notebook_shows_the_picture(monkeypatch):

@@ -58,17 +58,6 @@ def test_its_classes_are_those_that_can_be_asked_for(trained):
     assert ", wardrobe." in without and "other classes" not in without
 
 
-def test_it_says_once_where_rooms_come_from(trained, toy_run):
-    words, _ = model_card(trained, "tiny").split("## Settings")
-    assert "Rooms are sampled from: sampler." in words
-    assert "sphere" not in words and "`paper`" not in words
-    sphere = load_run(toy_run)
-    near = sphere.config.sampling.model_copy(update={"distribution": "kernel"})
-    kernel = replace(sphere, config=sphere.config.model_copy(update={"sampling": near}))
-    assert "Rooms are sampled from: kernel." in model_card(kernel, "tiny", latents=True)
-    assert "Rooms are sampled from: paper." in model_card(kernel, "tiny")
-
-
 def test_what_is_not_known_is_said(trained):
     card = model_card(trained, "tiny", latents=True)
     assert UNSTATED in card and "Not measured when this was packed" in card

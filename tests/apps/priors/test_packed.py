@@ -87,14 +87,6 @@ def test_without_latents_rooms_come_from_anywhere_and_are_not_remembered(sampler
         sample_rooms(back, 2, 0, "kernel")
 
 
-def test_with_latents_it_is_the_run_itself(toy_run, tmp_path):
-    path = packed_file(toy_run, tmp_path / "a.prior", latents=True)
-    trained, back = load_run(toy_run), load_run(path)
-    assert back.room_ids == trained.room_ids and back.stage == "shape"
-    assert torch.equal(back.logits, trained.logits)
-    assert_same(sample_rooms(trained, 3, 1), sample_rooms(back, 3, 1))
-
-
 @pytest.mark.parametrize("method", ["atiss", "sync2gen", "set_flow"])
 def test_methods_of_boxes_travel_too(method, toy_shards, tmp_path):
     config = tiny_baseline(toy_shards, method).with_label_set()

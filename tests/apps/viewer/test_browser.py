@@ -118,21 +118,6 @@ def test_the_room_follows_the_pointer(browser, page, monkeypatch):
     assert [said for said in log if "passive event listener" not in said] == []
 
 
-def test_what_does_not_work_is_said(browser, page):
-    click(browser, "Path")  # the folder opens
-    wait_for(lambda: "Draw path" in words(browser), "the folder stays closed")
-    end = browser.find_element("css selector", "input[value='paper:2']")
-    end.send_keys("000x")
-
-    def asked_again():
-        # The page sends what is typed at most every 50 ms: a click at once can overtake it.
-        click(browser, "Draw path")
-        time.sleep(1)
-        return "'paper:2000x' is neither" in words(browser)
-
-    wait_for(asked_again, "no sentence came")
-
-
 def test_a_request_is_typed_answered_completed_and_downloaded(browser, tmp_path):
     from selenium.webdriver import ActionChains
 

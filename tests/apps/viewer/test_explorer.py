@@ -13,7 +13,7 @@ from sceneprior.apps.api import Prior
 from sceneprior.apps.viewer.explorer import PATH_STEPS, SNAP, Explorer, Folder, Shown, make_map
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene, SceneObject
-from sceneprior.paper.prior import LatentCube, LatentSphere
+from sceneprior.paper.prior import LatentSphere
 from sceneprior.paper.sampling import LATENTS_FILE, decode_training_rooms, write_latents
 
 
@@ -133,20 +133,3 @@ def test_axes_are_the_principal_components(z):
     assert latent_map.room_at(tuple(beyond.tolist())) is None
     with refused("viewer/map_of_two_rooms"):
         make_map(LatentSphere(20, 8), z[:2])
-
-
-def test_moving_goes_where_the_pointer_is_and_keeps_the_rest(z, torch_rng):
-    latent_map = make_map(LatentSphere(20, 8), z)
-    moved = latent_map.moved(z[3], (0.3, -0.4))
-    assert moved.norm().item() == pytest.approx(1, abs=1e-6)
-    np.testing.assert_allclose(latent_map.place(moved[None])[0], [0.3, -0.4], atol=1e-6)
-    # No other point of the sphere at this place is nearer to where it began.
-    assert moved @ z[3] > latent_map.moved(z[4], (0.3, -0.4)) @ z[3]
-    back = latent_map.moved(moved, tuple(latent_map.rooms[3].tolist()))
-    torch.testing.assert_close(back, z[3], rtol=0, atol=1e-5)
-    cube = LatentCube(6)  # whose walls hold
-    inside = cube(torch.randn(20, 6, generator=torch_rng))
-    latent_map = make_map(cube, inside)
-    near = latent_map.moved(inside[1] * 0.2, (0.1, 0.05))
-    np.testing.assert_allclose(latent_map.place(near[None])[0], [0.1, 0.05], atol=1e-6)
-    assert latent_map.moved(inside[1], (9.0, 9.0)).abs().max() <= cube.half_edge + 1e-6

@@ -52,19 +52,6 @@ def test_rooms_come_from_the_sampler_and_others_if_asked(sampler_run, few_attemp
     assert early.distribution == "paper" and sample_rooms(early, 2, 0)[0].latent is not None
 
 
-def test_a_sampler_completes_rooms_of_a_run_that_draws_others_from_latents(sampler_run):
-    prior = sceneprior.load(sampler_run)
-    with_latents = prior.trained.config.model_dump(mode="json", by_alias=True)
-    with_latents["sampling"]["distribution"] = "paper"
-    config = type(prior.trained.config).model_validate(with_latents)
-    other = replace(prior, trained=replace(prior.trained, config=config))
-    assert other.distribution == "paper"
-    scene = Scene("mine", "front3d_bedroom", (BED,))
-    rooms = [each.complete(scene, 1, seed=2)[0] for each in (prior, other)]
-    assert rooms[0].objects[0].center_m == BED.center_m
-    np.testing.assert_array_equal(rooms[0].centers_m, rooms[1].centers_m)
-
-
 def test_runs_without_a_sampler_say_so(toy_run):
     prior = sceneprior.load(toy_run)
     with refused("requests/no_sampler"):
@@ -98,36 +85,6 @@ def test_counts_hold_exactly(prior):
         assert found.count("desk") >= 1 and found.count("cabinet") <= 1
         assert room.extra["wishes"][2] == {"wish": "2 nightstand", "holds": True}
         assert room.extra["request"] == {"floor": "5x4", "want": want}
-
-
-def test_small_rooms_hold_less(prior):
-    small, large = (prior.sample(12, seed=0, floor=floor) for floor in ("3x3", "6x6"))
-    assert sum(map(len, map(labels, small))) < sum(map(len, map(labels, large)))
-
-
-def test_without_a_floor_a_rectangle_is_drawn(prior):
-    rooms = prior.sample(3, seed=2, want={"double_bed": 2})
-    assert [labels(room).count("double_bed") for room in rooms] == [2, 2, 2]
-    assert len({room.floor_m.max() for room in rooms}) == 3
-    for room in rooms:
-        assert_on_floor(room)
-
-
-def test_nothing_reaches_through_the_ceiling_and_lamps_hang_from_it(prior):
-    rooms = prior.sample(4, seed=0, floor="4x4", ceiling_m=2.2, want={"ceiling_lamp": 1})
-    for room in rooms:
-        tops = room.centers_m[:, 1] + room.sizes_m[:, 1] / 2
-        assert room.ceiling_m == 2.2 and tops.max() <= 2.211
-        assert tops[labels(room).index("ceiling_lamp")] == pytest.approx(2.2, abs=1e-4)
-
-
-def test_where_floor_is_scarce_beds_stand_on_it_and_keep_their_size(prior):
-    want = {"double_bed": 1, "single_bed": 1, "desk": 2, "sofa": 1}
-    for room in prior.sample(2, seed=0, floor="3.4x3", openings="door", want=want):
-        for item in room.objects:
-            if "bed" in item.label:
-                assert item.center_m[1] - item.size_m[1] / 2 <= 0.151
-                assert item.size_m[0] * item.size_m[2] > 1.1  # m2
 
 
 def test_completions_hold_what_is_given_exactly_and_differ(prior):

@@ -32,9 +32,3 @@ def test_rectangles_lie_in_the_floor_and_cover_most_of_it(floor):
     boxes = shapely.box(x - width / 2, z - depth / 2, x + width / 2, z + depth / 2)
     assert shape.polygon.buffer(0.005).covers(shapely.union_all(boxes))
     assert shapely.union_all(boxes).area > 0.85 * shape.polygon.area
-
-
-def test_the_area_sets_the_size_that_contents_are_drawn_by():
-    shape = Floor(read_floor(L_SHAPE))
-    assert shape.extents_m.prod() == pytest.approx(shape.polygon.area) == 21
-    assert not shape.is_rectangle and Floor(read_floor("4x3")).is_rectangle

@@ -67,12 +67,6 @@ def test_relations_turn_with_the_room(relation, quarters):
     assert (related(relation, other, other, "bed") == found).all()
 
 
-def test_facing_is_the_front_of_the_object_itself():
-    chair = at(0, 0)
-    assert related("facing", items(chair, back=2), items(BED), "bed")[0, 0]
-    assert not related("facing", items(chair, back=0), items(BED), "bed")[0, 0]
-
-
 def test_under_a_lamp_and_under_a_window():
     lamp = items([0.1, 2.0, -3.0, 0.4, 0.4, 0.4])
     assert related("under", items(BED), lamp, "lamp")[0, 0]

@@ -21,15 +21,6 @@ def reached(*boxes: list[float], shape: RoomShape = SHAPE) -> list[bool]:
     return [bool(each) for each in found]
 
 
-def test_furniture_behind_a_barrier_is_not_reached():
-    desk = box(0, 1.2, 1, 0.5)
-    assert reached(desk) == [True]
-    barrier = box(0, 0.3, 4, 0.3)
-    assert reached(desk, barrier) == [False, True]
-    lifted = box(0, 0.3, 4, 0.3, bottom=2.0)
-    assert reached(desk, lifted) == [True, True]
-
-
 @pytest.mark.parametrize(("gap_m", "open_"), [(0.5, False), (0.56, False), (0.66, True)])
 def test_a_way_is_as_wide_as_it_says(gap_m, open_):
     barrier = box(-gap_m / 2, 0.3, 4 - gap_m, 0.3)

@@ -48,8 +48,3 @@ def test_sentences(text, floor, openings, counts, relations):
     assert found.floor == floor and found.openings == openings
     assert sorted(map(str, found.wishes.counts)) == sorted(counts)
     assert list(map(str, found.wishes.relations)) == relations
-
-
-def test_a_piece_that_the_prior_does_not_know_keeps_its_name():
-    (wish,) = read_sentence("a fridge", KNOWN, "front3d_bedroom").wishes.counts
-    assert str(wish) == "1 refridgerator"

@@ -48,18 +48,3 @@ def test_lists_are_drawn_as_the_network_says(contents):
         label = torch.tensor([listed])
         likely = contents.negative_log_likelihood(label, label > 0, extents_m[:1])
         assert_close(share, (-likely[0]).exp(), atol=0.01, rtol=0)
-
-
-def test_lists_go_on_from_what_is_given_and_keep_to_the_room(contents):
-    count = 500
-    uniform = torch.rand(count, SLOTS, generator=torch.Generator().manual_seed(1))
-    extents_m = torch.tensor([[3.0, 4.0]]).expand(count, -1)
-    there = torch.eye(CLASSES)[2].expand(count, -1)
-    free = torch.arange(count) % (SLOTS + 1)
-    drawn = contents.draw(there, free, extents_m, uniform)
-    assert ((drawn != END).sum(dim=1) <= free).all()
-    assert ((drawn != END).sum(dim=1) == free)[free == 1].any()
-    first = contents(there[0], extents_m[0]).softmax(dim=-1)
-    share = (drawn[free > 0, 0] == END).float().mean()
-    assert_close(share, first[END], atol=0.06, rtol=0)
-    assert there.sum() == count, "what was given stays as it was"

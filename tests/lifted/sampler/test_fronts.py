@@ -61,11 +61,6 @@ def test_a_box_at_a_wall_faces_the_room_and_one_at_a_table_faces_the_table():
     assert gaps_m[0, 0].tolist() == [pytest.approx(0.1), 1, 1, 1]
 
 
-def test_what_stands_diagonally_is_on_no_side():
-    apart = room([0.0, 0.5, 0.0, 1.0, 1.0, 1.0], [0.9, 0.5, 1.5, 1.0, 1.0, 1.0], looks=[0, 8])
-    assert _gaps_to_furniture(apart).eq(1).all()
-
-
 def test_fronts_turn_with_their_rooms():
     """Every symmetry of the room and of the looks tells the same sides of the prototype."""
     rng = torch.Generator().manual_seed(0)

@@ -70,21 +70,6 @@ def test_places_turn_with_the_room(placement, given, quarters):
     assert_close(there.log_prob(turn_places(place_m, by)), plain, rtol=0, atol=1e-12)
 
 
-def test_order_and_padding_of_objects_change_nothing(placement, given):
-    rooms, look, size_m, rectangle_m = given
-    place_m = torch.zeros(3, 2).double()
-    plain = distribution(placement, rooms, look, size_m, rectangle_m).log_prob(place_m)
-    swapped = rooms.take(torch.tensor([[1, 0], [1, 0], [0, 1]]))
-    assert_close(
-        distribution(placement, swapped, look, size_m, rectangle_m).log_prob(place_m), plain
-    )
-    boxes_m = rooms.boxes_m.where(rooms.is_object.unsqueeze(-1), 7.0)
-    filled = PosedRooms(rooms.object_class, rooms.is_object, boxes_m, looks=rooms.looks)
-    assert torch.equal(
-        distribution(placement, filled, look, size_m, rectangle_m).log_prob(place_m), plain
-    )
-
-
 def log_probs(one: Places, places_m: torch.Tensor) -> torch.Tensor:
     """Log-densities of many places in one room, in parts that need little memory."""
     with torch.no_grad():

@@ -12,15 +12,13 @@ from torch.testing import assert_close
 from sceneprior.core.boxes import turn_boxes
 from sceneprior.core.wall_lines import Wall
 from sceneprior.lifted.lifting.dataset import LiftedDataset
-from sceneprior.lifted.prototypes import PosedRooms
 from sceneprior.lifted.sampler.frames import (
-    FRAME_M,
     SYMMETRIES,
     rectangle_sides,
     rectangles_of,
     turned_rooms,
 )
-from sceneprior.lifted.sampler.rooms import SamplerRooms, frames_of, shuffled
+from sceneprior.lifted.sampler.rooms import SamplerRooms, frames_of
 
 
 @pytest.fixture(scope="module")
@@ -40,32 +38,6 @@ def test_objects_without_a_label_or_a_box_are_left_out():
     found = with_looks(lifted).rooms
     assert found.is_object.sum(dim=1).tolist()[:2] == [1, 2]
     assert found.object_class[0, 0] == 2
-
-
-def test_other_rooms_take_the_looks_of_the_training_rooms(rooms):
-    other = sampler_rooms(seed=5)
-    assert np.array_equal(other.prototypes.grids, rooms.prototypes.grids)
-    assert other.rooms.looks.max() < 8 * len(rooms.prototypes.grids)
-
-
-def test_rectangles_hold_all_footprints_and_no_more():
-    boxes_m = torch.tensor([[[0.0, 1, 0, 2, 2, 1], [2.0, 1, 1, 1, 1, 1], [9.0, 9, 9, 9, 9, 9]]])
-    here = torch.tensor([[True, True, False]])
-    found = rectangles_of(PosedRooms(here.long(), here, boxes_m))
-    assert_close(found, torch.tensor([[0.75, 0.5, 3.5, 2.0]]))
-    assert not rectangles_of(PosedRooms(here.long() * 0, here & False, boxes_m)).any()
-
-
-def test_frames_hold_the_rectangle_and_a_little_more(rooms):
-    generator = torch.Generator().manual_seed(0)
-    low, high = rectangle_sides(rectangles_of(rooms.rooms))
-    outs = []
-    for _ in range(50):
-        frame_low, frame_high = rectangle_sides(frames_of(rooms.rooms, generator))
-        outs += [low - frame_low, frame_high - high]
-    out = torch.cat(outs)
-    assert out.min() >= -1e-5
-    assert_close(out.square().mean().sqrt().item(), FRAME_M, rtol=0.1, atol=0)
 
 
 def wall(start, end, inward, error_m=0.01):
@@ -134,19 +106,6 @@ def test_symmetries_move_boxes_looks_and_rectangles_together(rooms):
     assert len(seen) == SYMMETRIES
 
 
-def test_shuffling_keeps_the_set_and_puts_padding_last(rooms):
-    batch = rooms.rooms
-    mixed = shuffled(batch, torch.Generator().manual_seed(3))
-    counts = batch.is_object.sum(dim=1)
-    assert torch.equal(mixed.is_object, torch.arange(3)[None] < counts[:, None])
-    for row, count in enumerate(counts.tolist()):
-        before, after = (
-            {(int(r.object_class[row, k]), *r.boxes_m[row, k].tolist()) for k in range(count)}
-            for r in (batch, mixed)
-        )
-        assert before == after
-
-
 def test_classes_may_meet_that_do_often_enough():
     lifted = lifted_rooms(12)
     for room in (1, 3, 5):  # of six with a third object: its box stands in the second's
@@ -156,11 +115,3 @@ def test_classes_may_meet_that_do_often_enough():
     lifted.its_boxes[1].centers_m[2] += 5
     lifted.its_boxes[3].centers_m[2] += 5
     assert not with_looks(lifted).may_meet(CLASSES).any()
-
-
-def test_rooms_are_drawn_of_common_prototypes_alone(rooms):
-    prototypes = rooms.prototypes._replace(common=np.arange(len(rooms.prototypes.grids)) < 1)
-    prototypes = prototypes._replace(object_class=np.abs(prototypes.object_class))
-    seen = sampler_rooms().assign_prototypes(prototypes)
-    assert seen.prototypes.object_class.tolist()[1:] == [-1] * (len(prototypes.grids) - 1)
-    assert seen.rooms.is_object.any() and (seen.rooms.looks[seen.rooms.is_object] < 8).all()

@@ -11,7 +11,6 @@ from torch import nn
 
 from sceneprior.apps.config import load_any_run
 from sceneprior.core.errors import ConfigError
-from sceneprior.lifted.sampler.frames import rectangles_of
 from sceneprior.lifted.sampler.network import SamplerConfig
 from sceneprior.lifted.sampler.rooms import SamplerRooms
 from sceneprior.lifted.sampler.stage import SamplerStage, negative_log_likelihood
@@ -67,26 +66,6 @@ def test_with_val_rooms_the_likeliest_is_kept(monkeypatch):
     for name, value in stage.sampler.state_dict().items():
         assert torch.equal(value, states[1][name])
     assert not all(torch.equal(v, states[2][k]) for k, v in states[1].items())
-
-
-def test_val_loss_is_the_same_each_time_and_leaves_the_learner_in_training():
-    rooms = sampler_rooms()
-    stage = stage_of(rooms, rooms, dropout=0.5)
-    stage.train()
-    assert torch.equal(stage.val_loss(), stage.val_loss())
-    assert stage.learner.training
-
-
-def test_a_sampler_is_taught_what_it_draws_from():
-    rooms = sampler_rooms()
-    sampler = small_sampler(rooms)
-    count = len(rooms.prototypes.grids)
-    assert (sampler.look_class[: 8 * count] > 0).all() and (
-        sampler.look_class[8 * count :] < 0
-    ).all()
-    drawn = sampler.rectangles(torch.rand(500), torch.randn(500, 4))
-    known = rectangles_of(rooms.rooms)[:, 2:]
-    assert known.min() * 0.5 < drawn[:, 2:].median() < known.max() * 2
 
 
 def test_a_run_ends_with_a_sampler(sampler_run):
