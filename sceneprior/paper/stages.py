@@ -44,8 +44,8 @@ class LatentStage(lightning.LightningModule, ABC):
         # DDP expects a gradient of every parameter that requires one.
         prior.requires_grad_(True)
         prior.shape.requires_grad_(not isinstance(stage, LayoutConfig))
-        boxes = isinstance(stage, StageConfig) and getattr(stage, "box_from", "proxy") == "proxy"
-        prior.bevels.requires_grad_(boxes and stage.proxy == "beveled_box")
+        boxes_from = getattr(stage, "box_from", "proxy"), getattr(stage, "proxy", None)
+        prior.bevels.requires_grad_(boxes_from == ("proxy", "beveled_box"))
         self.prior, self.latents, self.stage = prior, latents, stage
         self.loss, self.seed = config.loss, config.seed
         self.completeness_target = config.model.completeness_target

@@ -168,7 +168,7 @@ class SceneTransformer(nn.Module):
             x = self.decoder_norm(query + self._drop(decoder_out(mixed)))
             newest = self.decoder_end(decoder_ff(x))
             if self.output is not None:
-                newest = self.output.mlps[step](newest)
+                newest = self.output.get_submodule(f"mlps.{step}")(newest)
             features.append(newest)
         return torch.stack([F.pad(x, (0, 0, 0, len(z) - len(x))) for x in features], dim=1)
 
