@@ -220,12 +220,10 @@ class Metric:
     """Sets of rooms for which the metric is computed; the value of test rooms is `<key>_test`."""
     network: str | None = None
     """The network that reads the pictures (`inception`, `alexnet`, `effnet_lite0`), if any."""
-    boxes: bool = False
-    """True for metrics of pictures in which every object is drawn as its box (`--boxes`)."""
     needs: str = "a floor (floor_m) in the scenes"
     """Parts of a room that a metric of use needs besides objects."""
     protocol: Mapping[str, Any] = field(default_factory=dict)
-    """Entries of the metric in the protocol of a result file."""
+    """Entries of the metric in the protocol of a result file; text is the entry of its own key."""
     column: TableColumn | None = None
     """The metric's column in the table of `sceneprior compare`; None leaves the metric out."""
 
@@ -238,7 +236,7 @@ class Metric:
         """The option that the metric needs and the user left out; None if nothing is missing."""
         if self.network is not None and self.network not in networks:
             return f"--{self.network}"
-        return None if boxes or not self.boxes else "--boxes"
+        return "--boxes" if self.key.endswith("_boxes") and not boxes else None
 
 
 DEFINED: list[Metric] = []
@@ -253,6 +251,9 @@ def metric(
     A function that computes several metrics, such as the `Counts` of a scene, is decorated once
     for each.
     """
+
+    if isinstance(more.get("protocol"), str):
+        more["protocol"] = {key: more["protocol"]}
 
     def define(function: Function) -> Function:
         # Decorators run from the last to the first; tables show the first above the last.

@@ -4,7 +4,7 @@ the page of rooms to send to others."""
 import base64
 import io
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
@@ -38,10 +38,21 @@ FEWEST_FACES = 200
 """Smallest limit on the faces of one object, used on pages with many objects."""
 
 
-def render(template: str, **values: Any) -> bytes:
-    """Render a page from a template of this folder; a variable without a value is an error.
+def write_page(
+    path: Path,
+    template: str,
+    rooms: Mapping[str, Sequence[Scene]],
+    *,
+    flat: Sequence[str] = (),
+    shell: ShellName = "none",
+    **values: Any,
+) -> None:
+    """Write one self-contained HTML file of a few MB from a template of this folder, with the
+    pictures and 3D models of groups of rooms, by the group's name in the template.
 
-    The page loads nothing from a network: the policy in its head forbids it.
+    The page loads nothing from a network: the policy in its head forbids it. A variable of the
+    template without a value is an error. The groups `flat` have pictures alone, and `shell` is that
+    of `room_pictures`.
     """
     environment = Environment(
         loader=PackageLoader("sceneprior.evaluation", "."),
@@ -51,18 +62,23 @@ def render(template: str, **values: Any) -> bytes:
         lstrip_blocks=True,
     )
     script = files("sceneprior.evaluation").joinpath("model_viewer", "model-viewer-umd.min.js")
-    viewer = Markup(script.read_text("utf-8"))
-    page = environment.get_template(template).render(viewer=viewer, version=__version__, **values)
-    return page.encode()
+    shown = [(name, scene) for name, group in rooms.items() for scene in group]
+    objects = sum(len(scene.objects) for name, scene in shown if name not in flat)
+    most_faces = max(FACES_PER_PAGE // max(objects, 1), FEWEST_FACES)
+    drawn: dict[str, list[dict[str, str]]] = {name: [] for name in rooms}
+    for name, scene in shown:
+        drawn[name].append(room_pictures(scene, 0 if name in flat else most_faces, shell))
+    page = environment.get_template(template).render(
+        viewer=Markup(script.read_text("utf-8")),
+        version=__version__,
+        legend=_legend([scene for _, scene in shown]),
+        **drawn,
+        **values,
+    )
+    write_whole(path, page.encode())
 
 
-def faces_per_object(scenes: Sequence[Scene]) -> int:
-    """Limit on the faces of each object on a page that shows these rooms."""
-    objects = sum(len(scene.objects) for scene in scenes)
-    return max(FACES_PER_PAGE // max(objects, 1), FEWEST_FACES)
-
-
-def glb_of(scene: Scene, most_faces: int, shell: ShellName = "none") -> bytes:
+def glb_of(scene: Scene, most_faces: int, shell: ShellName) -> bytes:
     """The room on its floor as a GLB, meshes decimated to about `most_faces` faces.
 
     With walls (see `shows_walls`), only their faces towards the room, so that none hides it.
@@ -89,7 +105,7 @@ def data_uri(kind: str, content: bytes) -> str:
     return f"data:{kind};base64,{base64.b64encode(content).decode()}"
 
 
-def room_pictures(scene: Scene, most_faces: int = 0, shell: ShellName = "none") -> dict[str, str]:
+def room_pictures(scene: Scene, most_faces: int, shell: ShellName) -> dict[str, str]:
     """Draw a scene's plan and corner view, and export its 3D model.
 
     View and model have walls if `shell` is `walls`, or the room has doors or windows. `most_faces`
@@ -118,7 +134,7 @@ def room_pictures(scene: Scene, most_faces: int = 0, shell: ShellName = "none") 
     }
 
 
-def legend(scenes: Sequence[Scene]) -> list[tuple[str, str]]:
+def _legend(scenes: Sequence[Scene]) -> list[tuple[str, str]]:
     """(class name, CSS colour) of every class in the scenes, in the label set's order."""
     if not scenes:
         return []
@@ -146,14 +162,6 @@ def write_rooms_page(
 ) -> None:
     """Write one self-contained HTML file of a few MB, with `pictures` (caption, data URI) above the
     first rooms. `shell` is that of `room_pictures`."""
-    shown = scenes[:ROOMS_SHOWN]
-    most_faces = faces_per_object(shown)
-    page = render(
-        "rooms.html.jinja",
-        title=title,
-        subtitle=subtitle,
-        pictures=pictures,
-        rooms=[room_pictures(scene, most_faces, shell) for scene in shown],
-        legend=legend(shown),
-    )
-    write_whole(path, page)
+    rooms = {"rooms": scenes[:ROOMS_SHOWN]}
+    texts = {"title": title, "subtitle": subtitle, "pictures": pictures}
+    write_page(path, "rooms.html.jinja", rooms, shell=shell, **texts)

@@ -14,18 +14,10 @@ from PIL import Image, ImageDraw, ImageFont
 
 from sceneprior.core.boxes import match_scenes
 from sceneprior.core.classes import label_set
-from sceneprior.core.files import write_whole
 from sceneprior.core.ground_truth import known_in_3d, reference_scenes
 from sceneprior.core.scene import Scene
 from sceneprior.core.shards import Shard, iterate_rooms, list_shards
-from sceneprior.evaluation.page import (
-    data_uri,
-    faces_per_object,
-    legend,
-    png_uri,
-    render,
-    room_pictures,
-)
+from sceneprior.evaluation.page import data_uri, png_uri, write_page
 from sceneprior.evaluation.score_table import (
     RELATION_HEADINGS,
     headings,
@@ -36,7 +28,6 @@ from sceneprior.render.appearance import paint_ids, quiet_colors
 
 ROOMS_SHOWN = 8
 DECODED_SHOWN = 5
-UNFOLDING_SHOWN = 9
 
 
 def write_report(
@@ -70,18 +61,23 @@ def write_report(
         decoded: (decoded, true) training rooms.
         unfolding: Rooms along a geodesic of the hypersphere, from one room to another.
     """
-    generated = list(generated)[:ROOMS_SHOWN]
     known = known_in_3d(shards, "test")
-    test = reference_scenes(shards, "test", limit=ROOMS_SHOWN) if known else []
     with Shard(list_shards(shards, "train")[0]) as first:
         names = first.label_set
-    steps = np.linspace(0, len(unfolding) - 1, min(UNFOLDING_SHOWN, len(unfolding)))
-    along = [unfolding[row] for row in steps.round().astype(int)]
     pairs = list(decoded)[:DECODED_SHOWN]
-    in_3d = [*generated, *test, *(scene for pair in pairs for scene in pair)]
-    most_faces = faces_per_object(in_3d)
-    page = render(
+    write_page(
+        path,
         "report.html.jinja",
+        {
+            "generated": generated[:ROOMS_SHOWN],
+            "test": reference_scenes(shards, "test", limit=ROOMS_SHOWN) if known else [],
+            # Both scenes get the true floor, so that both pictures are framed alike.
+            "decoded": [replace(scene, floor_m=truth.floor_m) for scene, truth in pairs],
+            "truth": [truth for _, truth in pairs],
+            "unfolding": unfolding,
+        },
+        flat=["unfolding"],
+        summaries=[_summary(*pair) for pair in pairs],
         title=title,
         source=source,
         made_by=made_by,
@@ -90,11 +86,6 @@ def write_report(
         tiles=_tiles(scores),
         views=input_views(shards, rooms=3, views_per_room=2) if views else [],
         curves=curves_svg(curves) if curves else None,
-        decoded=[_pair(*pair, most_faces) for pair in pairs],
-        generated=[room_pictures(scene, most_faces) for scene in generated],
-        test=[room_pictures(scene, most_faces) for scene in test],
-        unfolding=[room_pictures(scene) for scene in along],
-        legend=legend([*in_3d, *along]),
         headings=headings(scores),
         rows=score_rows(scores),
         relation_headings=RELATION_HEADINGS,
@@ -103,20 +94,15 @@ def write_report(
         note=scores.get("note"),
         commands=commands,
     )
-    write_whole(path, page)
 
 
-def _pair(decoded: Scene, truth: Scene, most_faces: int) -> dict[str, Any]:
+def _summary(decoded: Scene, truth: Scene) -> str:
     match = match_scenes(decoded, truth)
     accuracy, iou = match.class_accuracy, match.mean_iou
-    summary = "an empty room"
-    if accuracy is not None and iou is not None:
-        right = f"{percent(accuracy)} of {match.truth_count} classes right"
-        summary = f"{right}, mean 3D box IoU {iou:.2f}"
-    # Both scenes get the true floor, so that both pictures are framed alike.
-    rooms = {"decoded": replace(decoded, floor_m=truth.floor_m), "truth": truth}
-    pictures = {name: room_pictures(scene, most_faces) for name, scene in rooms.items()}
-    return {**pictures, "summary": summary}
+    if accuracy is None or iou is None:
+        return "an empty room"
+    right = f"{percent(accuracy)} of {match.truth_count} classes right"
+    return f"{right}, mean 3D box IoU {iou:.2f}"
 
 
 _TILES = (

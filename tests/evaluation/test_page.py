@@ -122,11 +122,14 @@ def test_walls_of_a_model_are_seen_from_inside_only():
     outline = np.array([[-2.0, -2.0], [2.0, -2.0], [2.0, 2.0], [-2.0, 2.0]])
     door = Opening("door", (-0.5, -2.0), (0.5, -2.0), 0.0, 2.0)
     room = replace(bedroom(), floor_m=outline)
-    for walled in (glb_of(replace(room, openings=(door,)), 300), glb_of(room, 300, "walls")):
+    for walled in (
+        glb_of(replace(room, openings=(door,)), 300, "none"),
+        glb_of(room, 300, "walls"),
+    ):
         model = json.loads(walled[20 : 20 + int.from_bytes(walled[12:16], "little")])
         sides = {each["name"]: each.get("doubleSided", False) for each in model["materials"]}
         assert not sides["wall"] and not sides["ceiling"] and sides["double_bed"]
-    assert b"wall_0" not in glb_of(room, 300)
+    assert b"wall_0" not in glb_of(room, 300, "none")
 
 
 def test_the_viewer_is_what_its_page_says():

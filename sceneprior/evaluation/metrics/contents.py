@@ -96,7 +96,7 @@ def category_kl(
 
 @metric(
     "category_kl", "Category KL to test rooms", "nats", "closer", AGAINST_TEST,
-    protocol={"category_kl": f"KL(test || generated) in nats, epsilon {KL_EPSILON}, without void"},
+    protocol=f"KL(test || generated) in nats, epsilon {KL_EPSILON}, without void",
     column=TableColumn("category KL", 3),
 )  # fmt: skip
 def _category_kl(rooms: RoomSet, comparison: Comparison) -> Estimate:
@@ -180,11 +180,9 @@ def shared_volume_m3(scene: Scene) -> float:
 
 metric(
     "implausible_pairs", "Implausible intersecting pairs in a room", "mean", "lower",
-    protocol={
-        "implausible_pairs": f"boxes sharing more than {OVERLAP_SHARE:.0%} of the smaller one, "
-        f"classes that do so in under {PLAUSIBLE_SHARE:.0%} of the real training rooms that hold "
-        "both"
-    },
+    protocol=f"boxes sharing more than {OVERLAP_SHARE:.0%} of the smaller one, "
+    f"classes that do so in under {PLAUSIBLE_SHARE:.0%} of the real training rooms that hold "
+    "both",
     column=TableColumn(
         "implausible pairs", 2,
         "implausible pairs: intersecting pairs per room, of classes that seldom intersect in "
@@ -193,7 +191,7 @@ metric(
 )(_mean_of_pairs(intersecting, plausible=False))  # fmt: skip
 metric(
     "deep_pairs", "Implausible pairs deeper than 1 cm", "mean", "lower",
-    protocol={"deep_pairs": f"penetration over {DEEP_M} m, classes as in implausible_pairs"},
+    protocol=f"penetration over {DEEP_M} m, classes as in implausible_pairs",
     column=TableColumn("deeper than 1 cm", 2, "deeper than 1 cm: such pairs by depth"),
 )(_mean_of_pairs(lambda pairs: pairs.depths_m > DEEP_M, plausible=False))  # fmt: skip
 metric("implausible_litres", "Volume shared by implausible pairs", "mean, litres", "lower")(

@@ -122,13 +122,11 @@ def boosted_trees(
 
 @metric(
     "layout_classifier_accuracy", "Classifier accuracy, layouts", "", "half", AGAINST_TEST,
-    protocol={
-        "layout_classifier_accuracy": f"gradient boosting ({TREES} trees, depth 3, square root "
-        f"of the features per split), noise of {JITTER_M} m; trained on all real training and "
-        f"val rooms and {FOLDS - 1}/{FOLDS} of the set (at most as many rooms), evaluated on "
-        "the test rooms and the rest of the set; equal total weight for real and other rooms; "
-        "interval: over evaluated rooms, classifiers not retrained"
-    },
+    protocol=f"gradient boosting ({TREES} trees, depth 3, square root "
+    f"of the features per split), noise of {JITTER_M} m; trained on all real training and "
+    f"val rooms and {FOLDS - 1}/{FOLDS} of the set (at most as many rooms), evaluated on "
+    "the test rooms and the rest of the set; equal total weight for real and other rooms; "
+    "interval: over evaluated rooms, classifiers not retrained",
     column=TableColumn(
         "layout classifier", 2,
         "layout classifier: accuracy of a classifier of boxes and their relations",
@@ -268,11 +266,9 @@ def pair_distances(rooms: RoomSet, comparison: Comparison) -> PairDistances:
 @metric(
     "relation_distance_m", "Relations: gaps between classes", "mean over pairs, metres", "closer",
     AGAINST_TEST,
-    protocol={
-        "relation_distance_m": f"ordered pairs that {PAIR_SHARE:.0%} of the real training and "
-        f"val rooms have, gaps between footprints up to {FAR_M} m, Wasserstein-1 distance from "
-        "the test rooms' gaps, mean over pairs weighted by their number in the test rooms"
-    },
+    protocol=f"ordered pairs that {PAIR_SHARE:.0%} of the real training and "
+    f"val rooms have, gaps between footprints up to {FAR_M} m, Wasserstein-1 distance from "
+    "the test rooms' gaps, mean over pairs weighted by their number in the test rooms",
     column=TableColumn(
         "relations (m)", 3,
         "relations: mean Wasserstein distance of gaps between classes from the test rooms'",

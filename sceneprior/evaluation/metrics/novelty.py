@@ -153,10 +153,8 @@ def near_copy_threshold(training: Sequence[Scene]) -> float:
 
 @metric(
     "nearest_training_m", "Distance to the nearest training room", "mean, metres", "none",
-    protocol={
-        "nearest_training_m": f"boxes paired within classes, {MISSING_M} m for a missing one, "
-        "four quarter turns, mirrored or not"
-    },
+    protocol=f"boxes paired within classes, {MISSING_M} m for a missing one, "
+    "four quarter turns, mirrored or not",
     column=TableColumn(
         "nearest training room (m)", 2,
         "nearest training room: mean layout distance; near 0, a method has memorised training "
@@ -180,11 +178,9 @@ def _nearest_decoded(rooms: RoomSet, comparison: Comparison) -> Estimate | None:
 
 @metric(
     "near_copy_share", "Near copies of a training room", "share of rooms", "lower",
-    protocol={
-        "near_copy_share": f"under near_copy_m, the {NEAR_COPY_QUANTILE:.0%} quantile of the "
-        f"distances of real training rooms (at most {THRESHOLD_ROOMS}) to the nearest other one; "
-        "the same classes, each as often, at most one object added or left out"
-    },
+    protocol=f"under near_copy_m, the {NEAR_COPY_QUANTILE:.0%} quantile of the "
+    f"distances of real training rooms (at most {THRESHOLD_ROOMS}) to the nearest other one; "
+    "the same classes, each as often, at most one object added or left out",
     column=TableColumn(
         "near copies", 2,
         "near copies: share of rooms with the furniture of one training room at its places, "

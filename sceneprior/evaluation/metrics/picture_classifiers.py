@@ -216,11 +216,9 @@ def _alexnet(rooms: RoomSet, comparison: Comparison) -> Estimate:
 @metric(
     "sca_effnet_lite0", "Classifier accuracy, EfficientNet-Lite0", "", "half", PICTURED,
     "effnet_lite0",
-    protocol={
-        "sca_effnet_lite0": f"logistic regression (L2, C = {INVERSE_PENALTY}) on standardized "
-        f"features, {FOLDS}-fold, {REPEATS} repetitions with new folds and as many rooms of "
-        "the larger set as the smaller one has; interval: over rooms, classifiers not retrained"
-    },
+    protocol=f"logistic regression (L2, C = {INVERSE_PENALTY}) on standardized "
+    f"features, {FOLDS}-fold, {REPEATS} repetitions with new folds and as many rooms of "
+    "the larger set as the smaller one has; interval: over rooms, classifiers not retrained",
     column=TableColumn(
         "SCA", 2, "SCA: accuracy of a classifier that separates generated and test rooms"
     ),

@@ -268,7 +268,7 @@ for _network, _gap_key, _kid, _titles in (
     )
     for _title, (_key, _unit, _better, _sets, _function) in zip(_titles, _metrics, strict=True):
         metric(
-            _key, _title, _unit, _better, _sets, _network, _key.endswith("_boxes"),
+            _key, _title, _unit, _better, _sets, _network,
             protocol=_PROTOCOL.get(_key, {}), column=_COLUMNS.get(_key),
         )(partial(_function, _network))  # fmt: skip
 

@@ -164,10 +164,8 @@ def outside_count(scene: Scene) -> tuple[int, int]:
 
 @metric(
     "out_of_bounds_share", "Pieces out of the floor's bounds", "share; known floors only", "lower",
-    protocol={
-        "out_of_bounds_share": f"pieces with more than {OUTSIDE_SHARE:.0%} of their box outside "
-        "floor_m; rooms without floor_m are left out"
-    },
+    protocol=f"pieces with more than {OUTSIDE_SHARE:.0%} of their box outside "
+    "floor_m; rooms without floor_m are left out",
 )  # fmt: skip
 def _out_of_bounds(rooms: RoomSet, comparison: Comparison) -> Estimate:
     outside, pieces = np.array([outside_count(scene) for scene in rooms.scenes], dtype=float).T
@@ -209,10 +207,8 @@ def between_furniture(scene: Scene) -> float | None:
 
 metric(
     "walkable_share", "Walkable in one piece, between furniture", "share of free floor", "higher",
-    protocol={
-        "walkable_share": f"disc of {AGENT_RADIUS_M} m, {AGENT_HEIGHT_M} m high; exact areas; "
-        "_floor: within floor_m, else the rectangle around all furniture"
-    },
+    protocol=f"disc of {AGENT_RADIUS_M} m, {AGENT_HEIGHT_M} m high; exact areas; "
+    "_floor: within floor_m, else the rectangle around all furniture",
 )(mean_over_rooms(between_furniture, 1.0))  # fmt: skip
 metric(
     "walkable_share_floor", "Walkable in one piece, within the floor", "share; known floors only",
