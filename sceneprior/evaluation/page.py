@@ -163,5 +163,5 @@ def write_rooms_page(
     """Write one self-contained HTML file of a few MB, with `pictures` (caption, data URI) above the
     first rooms. `shell` is that of `room_pictures`."""
     rooms = {"rooms": scenes[:ROOMS_SHOWN]}
-    texts = {"title": title, "subtitle": subtitle, "pictures": pictures}
+    texts: dict[str, Any] = {"title": title, "subtitle": subtitle, "pictures": pictures}
     write_page(path, "rooms.html.jinja", rooms, shell=shell, **texts)

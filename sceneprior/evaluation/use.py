@@ -66,9 +66,10 @@ def measure_use(
             counts = resample_counts(len(scenes), resamples, (seed, 100 + number))
             columns[name] = {}
             for metric in USE:
-                shares = np.array([room.get(metric.key, (0.0, 0.0)) for room in measured], float)
+                pairs = [room.get(metric.key, (0.0, 0.0)) for room in measured]
+                sums, numbers = np.array(pairs, dtype=float).reshape(-1, 2).T
                 high = np.inf if metric.key.endswith("litres") else 1.0
-                columns[name][metric.key] = ratio(*shares.reshape(-1, 2).T, counts, high)
+                columns[name][metric.key] = ratio(sums, numbers, counts, high)
     left_out = {}
     for metric in USE:
         if columns["generated"][metric.key].value is None:

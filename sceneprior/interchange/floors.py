@@ -295,6 +295,7 @@ def _openings(
         heights_m = corners_m[near, 1].clip(min=0)
         bottom_m, top_m = float(heights_m.min()), float(heights_m.max())
         if np.ptp(reach_m) >= NARROWEST_M and top_m > bottom_m:
-            ends = (wall.start_m + wall.direction * way for way in (reach_m.min(), reach_m.max()))
-            found.append(Opening(kind, *(tuple(end.tolist()) for end in ends), bottom_m, top_m))
+            ways_m = np.array([reach_m.min(), reach_m.max()])
+            start, end = map(tuple, (wall.start_m + wall.direction * ways_m[:, None]).tolist())
+            found.append(Opening(kind, start, end, bottom_m, top_m))
     return found

@@ -62,7 +62,8 @@ class RunProgress(Callback):
             self._progress.stop()
             self._progress = None
 
-    on_exception = on_train_end
+    def on_exception(self, *_: Any) -> None:
+        self.on_train_end()
 
 
 class StepSeed(Callback):

@@ -76,16 +76,19 @@ def voxel_loss(scene: Scene) -> Counts:
         kept = _area(plan, wider) * max(min(high, top_m + FLUSH_M) - max(low, -FLUSH_M), 0.0)
         if plan.area * (high - low) - kept >= LEAST:
             cells = voxels(row)
-            middle, half = (cells[:, ::2] * PITCH_M).T, PITCH_M / 2
+            _, first, column = np.unique(
+                cells @ [1 << 20, 0, 1], return_index=True, return_inverse=True
+            )
+            middle, half = (cells[first, ::2] * PITCH_M).T, PITCH_M / 2
             squares = shapely.box(*(middle - half), *(middle + half))
-            within = shapely.intersects(floor, squares)
+            within = shapely.intersects(floor, squares)[column]
             level = (cells[:, 1] >= 0) & (cells[:, 1] <= round(top_m / PITCH_M))
             outside += int((~within | ~level).sum())
         for other in range(row + 1, len(plans)):
             height = min(high, spans[other][1]) - max(low, spans[other][0])
             if height > 0 and _area(plan, plans[other]) * height >= LEAST:
-                both = np.concatenate([voxels(row), voxels(other)])
-                shared += len(both) - len(np.unique(both, axis=0))
+                keys = (voxels(each) @ [1 << 40, 1 << 20, 1] for each in (row, other))
+                shared += len(np.intersect1d(*keys, assume_unique=True))
     oob_m3, mbl_m3 = outside * PITCH_M**3, shared * PITCH_M**3
     return {
         "respace_oob_litres": (1000 * oob_m3, 1.0),
