@@ -1,12 +1,11 @@
-"""Folders of rooms: what is written over, what is not, and the overview."""
+"""Folders of rooms: what is written over, and what is not."""
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 from PIL import Image
 
-from sceneprior.apps.rooms import OVERVIEW_TILE, overview, write_scene, write_scenes
+from sceneprior.apps.rooms import write_scene, write_scenes
 from sceneprior.core.scene import Scene, SceneObject
 
 
@@ -40,14 +39,3 @@ def test_a_failed_write_leaves_nothing_under_the_final_name(scene, tmp_path, mon
         write_scene(scene, tmp_path, "room")
     # The GLB was whole; without the JSON, which comes last, nobody takes it for a scene.
     assert [path.name for path in tmp_path.iterdir()] == ["room.glb"]
-
-
-def test_an_overview_holds_each_room_in_its_place():
-    empty = Scene("empty", "front3d_bedroom")
-    bed = SceneObject("double_bed", (0.0, 0.5, 0.0), (2.0, 1.0, 2.0))
-    height, width = OVERVIEW_TILE
-    sheet = overview([empty] * 4 + [Scene("bed", "front3d_bedroom", (bed,))])
-    assert sheet.shape == (2 * height, 4 * width, 3)
-    tiles = sheet.reshape(2, height, 4, width, 3).swapaxes(1, 2).reshape(8, -1, 3)
-    colourful = (np.ptp(tiles.astype(int), axis=-1) > 25).sum(axis=1)
-    assert colourful[4] > 1000 and not np.delete(colourful, 4).any()

@@ -1,4 +1,4 @@
-"""CAD models of folders: which there are, which are broken, and that points are sampled once."""
+"""CAD models: of folders, which are broken, points that are sampled once; the package's own."""
 
 import numpy as np
 import pytest
@@ -6,10 +6,14 @@ import trimesh
 from model_folder import blocks, corner_sofa, write_model, write_models
 from refusals import refused
 
+from sceneprior.apps.priors.packed import read_packed, shipped_priors
 from sceneprior.apps.retrieval import cad_models
-from sceneprior.apps.retrieval.cad_models import POINTS, open_models, read_glb
+from sceneprior.apps.retrieval.cad_models import POINTS, made_models, open_models, read_glb
+from sceneprior.apps.retrieval.retrieve import with_models
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputWarning
+from sceneprior.core.scene import Scene, SceneObject
+from sceneprior.furniture.catalog import furniture_classes, make_variants
 
 BED = blocks(((0, 0.3, 0), (1.8, 0.6, 2.0)), ((0, 0.6, -0.95), (1.8, 1.2, 0.1)))
 
@@ -154,3 +158,37 @@ def test_folders_without_a_usable_model_are_sentences(folder, own, tmp_path):
     ):
         with refused(f"apps/models_{name}", tmp=tmp_path):
             opened(given, labels)
+
+
+# -- The package's own furniture -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", shipped_priors())
+def test_every_class_of_a_shipped_prior_has_models(name):
+    classes = read_packed(shipped_priors()[name]).said.classes
+    assert all(made_models().of_class(label) for label in classes[1:])
+
+
+@pytest.mark.parametrize("label", sorted(furniture_classes()))
+def test_models_are_closed_fill_their_box_and_have_three_styles(label):
+    models = made_models()
+    of_class = models.of_class(label)
+    shapes = set()
+    for model_id, points in zip(of_class.model_ids, of_class.points, strict=True):
+        mesh = models.load(model_id)
+        assert trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False).is_watertight, model_id
+        np.testing.assert_allclose(mesh.vertices_m.min(axis=0), -0.5, atol=1e-12)
+        np.testing.assert_allclose(mesh.vertices_m.max(axis=0), 0.5, atol=1e-12)
+        assert np.abs(points).max() <= 0.5
+        shapes.add(mesh.faces.tobytes())
+        if label in ("armchair", "chair", "double_bed", "single_bed", "sofa"):
+            # Points above the seat or the mattress lie behind its centre on average.
+            assert np.mean(points[points[:, 1] > 0.3][:, 2]) < -0.1
+    assert len(of_class.model_ids) == len(make_variants(0, label))
+    assert len(shapes) >= 3
+
+
+def test_a_class_without_tables_has_no_models():
+    bathtub = SceneObject("bathtub", (0.0, 0.3, 0.0), (1.6, 0.6, 0.7))
+    (made,) = with_models([Scene("room", "scannet", (bathtub,))])
+    assert made.objects == (bathtub,) and made.extra["retrieval"] == [None]
