@@ -204,12 +204,7 @@ def empty_room(
         z0 = 0.0 if rng.random() < 0.5 else round(depth - notch_z, 2)
         notch = (x0, z0, round(x0 + notch_x, 2), round(z0 + notch_z, 2))
     layout = Layout(width, depth, round(float(rng.uniform(2.6, 3.0)), 2), notch)
-    _add_door(layout, rng)
-    return layout
-
-
-def _add_door(layout: Layout, rng: np.random.Generator) -> None:
-    """Sample a door near one end of a wall, and keep the floor in front of it clear."""
+    # The door is near one end of a wall, and the floor in front of it stays clear.
     walls = [wall for wall in layout.walls if wall.length_m > 1.8]
     wall = walls[rng.integers(len(walls))]
     half, middle = DOOR_M / 2, 0.1 + DOOR_M / 2
@@ -218,6 +213,7 @@ def _add_door(layout: Layout, rng: np.random.Generator) -> None:
     layout.door = wall, middle
     x, z = point_by(wall, middle, half)
     layout.kept_clear.append((x - half, z - half, x + half, z + half))
+    return layout
 
 
 def is_liveable(layout: Layout, reach: tuple[str, ...]) -> bool:

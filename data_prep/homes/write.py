@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from data_prep.homes.layout import DOOR_M, Layout, Piece, Rect, point_by
+from data_prep.homes.layout import DOOR_M, Layout, Piece, point_by
 from sceneprior.furniture.catalog import Model
 
 WALL_M = 0.12
@@ -103,7 +103,16 @@ def shell(layout: Layout) -> list[tuple[str, np.ndarray]]:
 
     Floor, ceiling, inner walls and the door face the room; outer walls face away from it.
     """
-    tiles = np.concatenate([_tile(rect) for rect in _rectangles(layout)])
+    (x0, x1), (z0, z1) = layout.beside_notch
+    rectangles = [(0.0, z0, layout.width, z1)]  # two if the floor is L-shaped
+    if layout.notch is not None:
+        rectangles.append((x0, layout.notch[1], x1, layout.notch[3]))
+    tiles = np.concatenate(
+        [
+            _quad((x0, 0.0, z0), (x0, 0.0, z1), (x1, 0.0, z1), (x1, 0.0, z0))
+            for x0, z0, x1, z1 in rectangles
+        ]
+    )
     ceiling = tiles[:, ::-1] + np.array([0.0, layout.height, 0.0])
     walls = layout.walls
     outward = np.array([wall.outward for wall in walls])
@@ -124,26 +133,15 @@ def shell(layout: Layout) -> list[tuple[str, np.ndarray]]:
     ]
 
 
-def _rectangles(layout: Layout) -> list[Rect]:
-    """Split the floor into rectangles: one, or two if it is L-shaped."""
-    (x0, x1), (z0, z1) = layout.beside_notch
-    if layout.notch is None:
-        return [(x0, z0, x1, z1)]
-    return [(0.0, z0, layout.width, z1), (x0, layout.notch[1], x1, layout.notch[3])]
-
-
-def _tile(rect: Rect) -> np.ndarray:
-    """Make a rectangle of two triangles that face up."""
-    x0, z0, x1, z1 = rect
-    a, b, c, d = (x0, 0.0, z0), (x0, 0.0, z1), (x1, 0.0, z1), (x1, 0.0, z0)
-    return np.array([[a, b, c], [a, c, d]])
-
-
 def _wall(start: np.ndarray, end: np.ndarray, height: float) -> np.ndarray:
     """Make a wall of two triangles; it faces left of the direction start to end in (x, z)."""
     (x0, z0), (x1, z1) = start, end
-    a, b, c, d = (x0, 0.0, z0), (x1, 0.0, z1), (x1, height, z1), (x0, height, z0)
-    return np.array([[a, b, c], [a, c, d]])
+    return _quad((x0, 0.0, z0), (x1, 0.0, z1), (x1, height, z1), (x0, height, z0))
+
+
+def _quad(*corners: tuple[float, float, float]) -> np.ndarray:
+    """Two triangles, (2, 3, 3), of four corners, counter-clockwise where they face."""
+    return np.array(corners)[[[0, 1, 2], [0, 2, 3]]]
 
 
 def _mesh(uid: str, number: int, kind: str, triangles: np.ndarray) -> dict[str, Any]:
