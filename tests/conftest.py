@@ -24,7 +24,7 @@ from browser import browser  # noqa: F401 (a fixture)
 from golden_values import TAKE_RUNS
 from kept_runs import LIFTED, add_lifted, take_lifted, write_kept_run
 from threadpoolctl import threadpool_limits
-from tiny_runs import tiny_config, tiny_lifted, tiny_sampler_config
+from tiny_runs import tiny_config, tiny_sampler_config
 from toy_rooms import write_toy_shards
 
 from sceneprior.core.views import images_of_split
@@ -153,18 +153,3 @@ def few_attempts(monkeypatch: pytest.MonkeyPatch) -> None:
 
     few = draw.PLAIN._replace(attempts=6, attempts_per_plan=2, whole=5)
     monkeypatch.setattr(draw, "PLAIN", few)
-
-
-@pytest.fixture
-def grid_prior(trained):
-    """The toy run's prior with occupancy grids for shapes, which are untrained."""
-    from sceneprior.lifted.config import TrainedLifted
-
-    shards = Path(trained.config.data.shards)
-    config = tiny_lifted(shards)
-    prior = config.build_prior()
-    layout = trained.prior.state_dict()
-    kept = {name: value for name, value in layout.items() if not name.startswith("shape.")}
-    prior.load_state_dict(kept, strict=False)
-    prior.eval().requires_grad_(False)
-    return TrainedLifted(prior, trained.logits, trained.room_ids, config, "shape")

@@ -1,29 +1,67 @@
-"""Looks along a path: where they are shown, and parts that pose and stretch as meshes do."""
+"""Looks along a path: where they are shown, and blends without jumps, whose meshes stay closed."""
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 from parts_of_rooms import CORNER, TABLE
 
-from sceneprior.core.parts import filled_cells
-from sceneprior.core.views import DecodedScenes
-from sceneprior.lifted.prototype_decoder import PosedScenes, PrototypeConfig, PrototypeDecoder
-from sceneprior.lifted.prototypes import Prototypes
-from sceneprior.lifted.shape_morphing import appearances_of
+from sceneprior.core.parts import CYLINDER, DOME, Parts, filled_cells, surface_of_parts
+from sceneprior.lifted.shape_morphing import appearances_of, blend_parts, matched_parts
+
+ROUND = Parts(
+    np.array([CYLINDER, CYLINDER, DOME]), np.zeros(3, np.int64),
+    np.array([
+        [[-0.5, 0.5], [0.375, 0.5], [-0.5, 0.5]],
+        [[-0.125, 0.125], [-0.375, 0.375], [-0.125, 0.125]],
+        [[-0.375, 0.375], [-0.5, -0.375], [-0.375, 0.375]],
+    ]),
+)  # fmt: skip
+SOFA = CORNER._replace(
+    outline=np.array([[-0.5, -0.5], [0.2, -0.5], [0.5, -0.1], [0.5, 0.5], [-0.3, 0.5], [-0.5, 0.3]])
+)
+SHAPES = {"table": TABLE, "corner": CORNER, "round": ROUND, "sofa": SOFA}
+PAIRS = [("table", "corner"), ("corner", "sofa"), ("round", "table"), ("round", "sofa")]
+
+
+def volume(parts: Parts) -> float:
+    mesh = trimesh.Trimesh(*surface_of_parts(parts))
+    assert mesh.is_watertight and mesh.is_winding_consistent
+    assert np.abs(parts.ends).max() == np.abs(parts.ends.min(axis=0)[:, 0]).min() == 0.5
+    assert parts.ends.max(axis=0)[:, 1].min() == 0.5, "they fill their box on all sides"
+    return float(mesh.volume)
+
+
+@pytest.mark.parametrize(("first", "second"), PAIRS)
+def test_shares_of_0_and_1_are_the_ends(first, second):
+    a, b = SHAPES[first], SHAPES[second]
+    matched = matched_parts(a, b)
+    for share, end, same in ((0.0, a, matched[0]), (1.0, b, matched[1])):
+        assert blend_parts(*matched, share) is same
+        # Hidden solids and added corners change nothing.
+        np.testing.assert_array_equal(filled_cells(same, 30, 1.1), filled_cells(end, 30, 1.1))
+        assert volume(same) == pytest.approx(volume(end), abs=2e-3)  # every solid grows by 5e-4
+
+
+@pytest.mark.parametrize(("first", "second"), PAIRS)
+def test_volumes_change_without_jumps_and_meshes_stay_closed(first, second):
+    matched = matched_parts(SHAPES[first], SHAPES[second])
+    volumes = [volume(blend_parts(*matched, share)) for share in np.linspace(0, 1, 41).tolist()]
+    # All shapes lie in a box of volume 1, and no side moves by more than 1 / 40 of it.
+    assert np.abs(np.diff(volumes)).max() < 0.1 and min(volumes) > 0.01
+    near = [volume(blend_parts(*matched, share)) for share in (0.0, 1e-5, 1 - 1e-5, 1.0)]
+    assert np.abs(np.diff(near)[[0, 2]]).max() < 2e-3  # sides move in steps of a thousandth
+
+
+@pytest.mark.parametrize(("first", "second"), PAIRS)
+def test_the_way_back_is_the_way_there(first, second):
+    there = matched_parts(SHAPES[first], SHAPES[second])
+    back = matched_parts(SHAPES[second], SHAPES[first])
+    for one, other in zip(there, back[::-1], strict=True):
+        for here, same in zip(one, other, strict=True):
+            np.testing.assert_array_equal(here, same)
+
 
 STEPS = 129
-
-
-@pytest.fixture
-def decoder() -> PrototypeDecoder:
-    """Two prototypes, a corner and a table."""
-    decoder = PrototypeConfig(prototypes=2, codes=8, cells=16).build(6)
-    parts = (CORNER, TABLE)
-    grids = np.stack([filled_cells(each, 16, 1.1) for each in parts])
-    sizes_m = np.array([[2.0, 0.5, 1.0], [1.0, 0.8, 0.6]])
-    decoder.set_prototypes(Prototypes(parts, grids, sizes_m, np.array([1, 2]), np.ones(2, bool)))
-    return decoder
 
 
 def test_looks_are_shown_at_the_ends_and_in_the_middle_of_where_they_hold():
@@ -47,36 +85,3 @@ def test_an_object_that_comes_and_goes_has_its_own_looks_each_time():
     assert appearances_of(looks, np.zeros(STEPS, bool)) == []
     (once,) = appearances_of(looks, np.arange(STEPS) == 10)
     assert once.at(10 / 128) == (1, 1, 0.0)
-
-
-def decoded(looks) -> DecodedScenes:
-    """Rooms of one object, which has these looks."""
-    rooms = len(looks)
-    return PosedScenes(
-        torch.zeros(rooms, 1, 3), torch.zeros(rooms, 1, 3), torch.ones(rooms, 1, 3),
-        torch.ones(rooms, 1), looks=torch.tensor(looks).unsqueeze(1),
-    )  # fmt: skip
-
-
-def test_shapes_are_the_decoded_ones_at_the_ends_and_change_between(decoder):
-    looks = [3] * 65 + [12] * 64
-    path, some = decoded(looks), decoded([looks[0], looks[20], looks[80], looks[-1]])
-    places = torch.tensor([0.0, 20 / 128, 80 / 128, 1.0], dtype=torch.float64)
-    rooms = decoder.along_path(some, places, path, torch.ones(STEPS, 1, dtype=torch.bool))
-    for room in (0, 3):
-        there, here = decoder.mesh_of(some, room, 0), decoder.mesh_of(rooms, room, 0)
-        np.testing.assert_array_equal(here.vertices_m, there.vertices_m)
-        assert decoder.solids_of(rooms, room, 0) == decoder.solids_of(some, room, 0)
-    for room in (1, 2):
-        mesh = decoder.mesh_of(rooms, room, 0)
-        here = trimesh.Trimesh(mesh.vertices_m, mesh.faces)
-        assert here.is_watertight
-        bounds = np.array([here.bounds, [[-0.5] * 3, [0.5] * 3]])
-        np.testing.assert_allclose(*bounds, atol=2e-3)
-        solids = decoder.solids_of(rooms, room, 0)
-        union = trimesh.boolean.union([trimesh.creation.box(bounds=each[1:]) for each in solids])
-        assert union.volume == pytest.approx(here.volume, rel=0.02)
-    bare = decoded(looks[:2])
-    no_looks = DecodedScenes(*(getattr(bare, name) for name in (
-        "class_logits", "centers_m", "sizes_m", "completeness_logits")))  # fmt: skip
-    assert decoder.along_path(no_looks, places[:2], no_looks, torch.ones(2, 1) > 0) is no_looks

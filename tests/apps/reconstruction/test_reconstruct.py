@@ -23,36 +23,6 @@ def short(monkeypatch):
     monkeypatch.setitem(SCHEDULES, "short", FitSchedule(steps=10, drop_at=6, patience=0))
 
 
-def test_objects_answer_for_masks_in_their_order(trained, images):
-    found = reconstruct(trained, images, "short")
-    assert [one.image.name for one in found] == [image.name for image in images]
-    for one in found:
-        assert len(one.scene.objects) == len(one.image.rows)
-        for item in one.scene.objects:
-            assert item.mesh is not None and item.label != "void"
-            low, high = item.mesh.vertices_m.min(axis=0), item.mesh.vertices_m.max(axis=0)
-            np.testing.assert_allclose((low + high) / 2, item.center_m, atol=1e-4)
-            np.testing.assert_allclose(high - low, item.size_m, atol=1e-4)
-
-
-def test_grids_are_fitted_by_classes_and_boxes_alone(grid_prior, images, monkeypatch):
-    """No step decodes a grid; the answer has the surfaces of one object a mask."""
-    decoded, decode = [], grid_prior.prior.decode
-
-    def counted(z, with_shape=True, wanted=None):
-        decoded.append(with_shape)
-        return decode(z, with_shape, wanted)
-
-    monkeypatch.setattr(grid_prior.prior, "decode", counted)
-    found = reconstruct(grid_prior, images[:2], "short")
-    assert decoded[-1] and not any(decoded[:-1]) and len(decoded) > 10
-    for one in found:
-        assert one.mask_iou is None and len(one.scene.objects) == len(one.image.rows)
-        for item in one.scene.objects:
-            away = np.abs(item.mesh.vertices_m - np.array(item.center_m))
-            assert (away <= np.array(item.size_m) / 2 + 1e-6).all()
-
-
 def test_images_of_any_size_and_number_come_back_in_their_order(trained, images, monkeypatch):
     half = replace(
         images[1],

@@ -1,7 +1,8 @@
-"""`eval-svr` on fixed scenes: scores as before, and the scenes that it refuses."""
+"""`eval-svr` on fixed scenes: scores as before, and training rooms as baselines."""
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from golden_values import assert_as_before
 from refusals import refused
@@ -10,6 +11,7 @@ from sceneprior.apps.reconstruction.score import evaluate_scenes
 from sceneprior.apps.rooms import write_scenes
 from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.views import images_of_split
+from sceneprior.lifted.reconstruction.known_rooms import KnownRooms, mask_overlap
 
 
 @pytest.fixture
@@ -35,14 +37,14 @@ def test_scores_are_as_before(answers, toy_shards):
     assert_as_before("apps/svr_scores", found, rel=1e-3, abs=1e-4)
 
 
-def test_scenes_that_do_not_match_an_image_are_refused(answers, toy_shards, tmp_path):
-    (first, *_), _ = answers
-    for name, changed in {
-        "no_view": {"extra": {"room_id": first.extra["room_id"]}},
-        "too_few_objects": {"objects": first.objects[1:]},
-        "no_such_room": {"extra": {"room_id": "attic", "view": 0}},
-    }.items():
-        folder = tmp_path / name
-        write_scenes([replace(first, **changed)], folder)
-        with refused(f"apps/svr_{name}", tmp=tmp_path, shards=toy_shards):
-            evaluate_scenes(folder, toy_shards, "test", 0)
+def test_nearest_rooms_are_those_of_the_image_under_another_name(toy_shards, renderer):
+    rooms = KnownRooms(toy_shards)
+    images = images_of_split(toy_shards, "train", 0, limit=4)[0]
+    for image in images:
+        answer = rooms.nearest(replace(image, room_id="unknown"), renderer)
+        assert answer.scene.name == image.room_id and answer.scene.extra["turned_degrees"] == 0
+        assert mask_overlap(answer, image, renderer) > 0.9
+        assert rooms.nearest(image, renderer).scene.name != image.room_id
+    rooms.scenes = [scene for scene in rooms.scenes if scene.name == images[0].room_id]
+    with refused("lifted/only room"):
+        rooms.drawn(images[0], np.random.default_rng(0))

@@ -9,13 +9,9 @@ from torch.testing import assert_close
 from sceneprior.apps.reconstruction.own_image import level_camera
 from sceneprior.core.views import ObservedImage
 from sceneprior.lifted.reconstruction import objects as candidates
-from sceneprior.lifted.reconstruction.objects import (
-    answer_images,
-    likeliest_box,
-)
+from sceneprior.lifted.reconstruction.objects import answer_images
 from sceneprior.lifted.reconstruction.placing import (
     Outlines,
-    Placed,
     outlines_of,
     place_objects,
     projected_extents,
@@ -51,23 +47,6 @@ def seen(points_m) -> Outlines:
     return given._replace(extents=extents.minimum(border), clear=torch.ones_like(given.clear))
 
 
-def test_outlines_of_a_rectangle_are_its_sides_and_corners():
-    outlines = outlines_of(painted((24, 18, 48, 54)))
-    left, top, right, bottom = 0.25, 0.25, 0.5, 0.75
-    expected = [-left, -top, right, bottom, -left - top, right - top, right + bottom, bottom - left]
-    assert_close(outlines.extents, torch.tensor([expected]))
-    assert outlines.clear.all()
-
-
-def test_a_corner_that_something_hides_or_the_image_cuts_is_not_clear():
-    hidden = outlines_of(painted((24, 18, 48, 54), (48, 44, 70, 60)))
-    assert hidden.clear[0].tolist() == [True] * 6 + [False, True]
-    cut = outlines_of(painted((60, 40, 96, 72)))
-    assert cut.clear[0].tolist() == [True] * 5 + [False, False, False]
-    # Sides that preparing calls hidden, by what has no id, hide the corners between them.
-    assert not outlines_of(painted((24, 18, 48, 54), clear=False)).clear.any()
-
-
 def test_slopes_of_extents_are_those_of_finite_differences():
     torch.manual_seed(0)
     points = (CUBE * torch.tensor([1.0, 0.8, 0.6]) + torch.tensor([0.3, 0.5, -1.0])).double()
@@ -91,14 +70,6 @@ def test_an_object_of_the_right_size_goes_where_it_stands(place):
     assert placed.energy.item() < 0.2
     wrong = place_objects(CUBE[None], size * 1.4, torch.zeros(1), masks)
     assert wrong.energy.item() > placed.energy.item() + 0.5
-
-
-def test_the_box_that_most_agree_with_wins_over_a_slightly_likelier_one():
-    centers = torch.tensor([[0.0, 0, 0], [3.0, 0, 0], [3.02, 0, 0], [2.98, 0, 0]])
-    placed = Placed(centers, torch.tensor([0.9, 1.0, 1.0, 1.0]))
-    assert likeliest_box(placed, torch.ones(4, 3)) == 1
-    lone = placed._replace(energy=torch.tensor([0.0, 9.0, 9.0, 9.0]))
-    assert likeliest_box(lone, torch.ones(4, 3)) == 0
 
 
 def test_a_run_whose_rooms_are_all_empty_says_so(trained, images, monkeypatch):
