@@ -114,7 +114,9 @@ class Clock(Callback):
         torch.set_float32_matmul_precision(self.matmul)  # overrides "high", which `fit` sets
         trained = {n: p.nbytes for n, p in pl_module.named_parameters() if p.requires_grad}
         latents = sum(size for name, size in trained.items() if name.startswith("latents."))
-        self._now = StageTimes(len(pl_module.rooms), sum(trained.values()) - latents, latents)
+        self._now = StageTimes(
+            len(trainer.train_dataloader.dataset), sum(trained.values()) - latents, latents
+        )
         self._name = Path(trainer.default_root_dir).name
         self.stages[self._name] = self._now
         if torch.cuda.is_available():
