@@ -7,6 +7,7 @@ A fenced block is run by its language (`CHECKS`), or says why not in the line ab
 import ast
 import json
 import re
+import runpy
 import shlex
 import subprocess
 import sys
@@ -171,6 +172,15 @@ def test_the_site_builds_without_a_warning(tmp_path: Path):
         name for name in get_command(app).commands if f"sceneprior {name}" not in commands
     ] == []
     assert "Prior" in (tmp_path / "api.html").read_text()
+
+
+def test_every_command_is_in_the_reference():
+    """The page that the site makes from the commands' help has each, with what it does."""
+    pytest.importorskip("mkdocs", reason="no mkdocs here: pip install -e '.[docs]'")
+    page = runpy.run_path(str(ROOT / "docs/hooks.py"))["commands_page"]()
+    told = dict(re.findall(r"^## `sceneprior ([a-z-]+)`\n\n(.+)$", page, re.MULTILINE))
+    assert set(told) == set(get_command(app).commands)
+    assert all(words.endswith((".", ":")) and len(words) > 20 for words in told.values()), told
 
 
 # -- Names -----------------------------------------------------------------------------------------

@@ -55,7 +55,6 @@ TABLES = ("docs/results.md", "docs/performance.md", "docs/experiments/", "docs/s
 ELSEWHERE = {
     "make demo": "tests/apps/experiments/test_demo.py runs the command that it is",
     "make test": "this is it",
-    "out/small/": "tests/test_readme.py runs the block with nothing cut short",
     "compare/paper.yaml": "tests/apps/experiments/test_compare.py compares toys",
     "compare/single_view.yaml": "tests/apps/experiments/test_compare.py compares toys",
     "--devices 2": "tests/training/test_processes.py trains in two processes",
