@@ -23,7 +23,6 @@ from data_prep.engine.source import pool
 from data_prep.readers import open_reader
 from data_prep.readers.annotations import NYU40, SHELL, ids_and_classes
 from data_prep.readers.hypersim import pinhole, straight_grid
-from data_prep.readers.rooms import numbered
 from sceneprior.core.classes import STUFF, label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.ground_truth import reference_scenes
@@ -126,11 +125,6 @@ def test_objects_without_a_box_leave_a_room_without_ground_truth(room, tmp_path)
         file["dataset"][300] = np.nan
     (made,) = prepared("hypersim", tmp_path).values()
     assert made.truth is None and made.notes[-1] == "1 of 2 objects have no 3D box: no ground truth"
-
-
-def test_an_unknown_label_set_is_no_room_without_objects():
-    with pytest.raises(InputError, match="bedrom"):
-        numbered(np.zeros((1, 4, 4), np.int32), {1: "bed"}, "bedrom", "here")
 
 
 def relabel(scene, **names):

@@ -6,7 +6,6 @@ from scipy.spatial.transform import Rotation
 
 from data_prep.readers.frames import (
     choose_frames,
-    is_pose,
     mask_intrinsics,
     room_cameras,
     sampled_lines,
@@ -40,23 +39,6 @@ def test_lost_poses_and_missing_masks_are_counted_and_make_room():
     )
 
 
-def test_what_is_a_pose():
-    turn = np.eye(4)
-    turn[:3, :3] = Rotation.random(rng=0).as_matrix()
-    turn[:3, 3] = 100, -3, 5
-    rounded = turn.astype(np.float32)
-    mirrored, scaled, sheared, flat, homogeneous, huge, empty = (turn.copy() for _ in range(7))
-    mirrored[:3, 0] *= -1
-    scaled[:3, :3] *= 1.02
-    sheared[:3, 0] += 0.02
-    flat[:3, 2] = 0
-    homogeneous[3] = 1, 0, 0, 1
-    huge[:3, :3] = 1e38
-    empty[:] = 0
-    bad = [mirrored, scaled, sheared, flat, homogeneous, huge, empty]
-    assert is_pose(np.stack([turn, rounded, *bad])).tolist() == [True, True, *[False] * 7]
-
-
 def test_room_cameras_are_rigid_inverses_of_poses(rng):
     poses = still(5).astype(np.float64)
     poses[:, :3, :3] = Rotation.random(5, rng=2).as_matrix()
@@ -87,30 +69,3 @@ def test_a_sampled_pixel_is_where_the_lens_says(image_size):
         ray = np.linalg.inv(K) @ (columns[j] + 0.5, rows[i] + 0.5, 1)
         # Only rounding: numbers of the size of a pixel coordinate.
         np.testing.assert_allclose(lens @ ray, (j + 0.5, i + 0.5, 1), atol=1e-10)
-
-
-def test_masks_of_another_size_show_the_same_picture():
-    """640 x 480 masks of 1296 x 968 colour: the corners stay corners, whatever is stored."""
-    for image_size in ((480, 640), QUARTER_SIZE, FULL_SIZE):
-        lens = mask_intrinsics(K, FULL_SIZE, (480, 640), image_size)
-        rows, columns = (sampled_lines(*pair) for pair in zip((480, 640), image_size, strict=True))
-        rays = np.linalg.inv(K) @ np.stack(
-            [
-                (columns[: len(rows)] + 0.5) / 640 * 1296,
-                (rows[: len(columns)] + 0.5) / 480 * 968,
-                np.ones(len(rows)),
-            ]
-        )
-        u, v, _ = lens @ rays - (np.arange(len(rows)) + 0.5)
-        # Uneven steps cannot all be met: none is off by more than 3/4 of a mask pixel.
-        step = np.array([640 / image_size[1], 480 / image_size[0]])
-        assert (np.abs([u, v]).max(axis=1) <= 0.75 / step).all()
-        if image_size == (480, 640):
-            assert np.abs([u, v]).max() < 1e-10
-
-
-def test_lines_are_sampled_as_shards_sample_them():
-    """`Shard.read_instance_ids(step=4)` of a full-size shard and a quarter-size shard agree."""
-    np.testing.assert_array_equal(sampled_lines(968, 242), np.arange(968)[2::4])
-    np.testing.assert_array_equal(sampled_lines(7, 7), np.arange(7))
-    assert sampled_lines(3, 6).tolist() == [0, 0, 1, 1, 2, 2]

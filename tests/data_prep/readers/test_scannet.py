@@ -10,7 +10,6 @@ import pytest
 from refusals import refused
 from room_scans import ROOM_TABLE, make_room_scan
 from scan_files import (
-    BOX_FACES,
     TABLE,
     make_scan,
     png,
@@ -26,13 +25,11 @@ from data_prep.engine.source import RoomTask, pool
 from data_prep.inspection.verify import agreement_of, verify
 from data_prep.readers.annotations import read_labels
 from data_prep.readers.rooms import focal_and_center, unoccluded
-from data_prep.readers.scan_files import open_masks, read_mesh, read_sens
+from data_prep.readers.scan_files import open_masks, read_sens
 from data_prep.readers.scannet import (
     FULL_SIZE,
     QUARTER_SIZE,
     ScanNet,
-    find_scans,
-    split_scans,
 )
 from sceneprior.core.classes import STUFF, label_set
 from sceneprior.core.errors import InputError
@@ -127,21 +124,6 @@ def test_masks_are_read_in_place(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_mesh_cut_anywhere(tmp_path, rng):
-    path = write_ply(tmp_path / "a.ply", rng.normal(size=(8, 3)), BOX_FACES)
-    data = path.read_bytes()
-    begin = data.index(b"end_header\n") + 11
-    for end in range(0, len(data), 3):
-        path.write_bytes(data[:end])
-        try:
-            found = read_mesh(path)
-        except InputError as error:
-            assert "a.ply is not a mesh" in str(error) or "a.ply holds no vertices" in str(error)
-        else:
-            # Half the vertices would be noticed beside segs.json; lost triangles are not.
-            assert len(found.vertices_m) == 8 and end >= begin + 8 * 16
-
-
 def test_raw_categories_become_the_nineteen_classes(tmp_path):
     rows = [*TABLE, ("12", "chair", "chair", "4646", "7", "table"), ("13", "short")]
     labels = read_labels(write_table(tmp_path / "a.tsv", rows))
@@ -155,22 +137,6 @@ def test_raw_categories_become_the_nineteen_classes(tmp_path):
     assert labels.is_shell("wall") and labels.is_shell("floor") and not labels.is_shell("backpack")
     rows = [("nyu40class", "x", "raw_category"), ("bed", "1", 'a 12" bed'), ("sofa",)]
     assert read_labels(write_table(tmp_path / "a.tsv", rows)).nyu40 == {'a 12" bed': "bed"}
-
-
-def test_the_lists_decide_and_the_rest_is_named(tmp_path):
-    for name in ("scene0001_00", "scene0000_01", "scene0000_00", "notes", "scene0002_00", "mine"):
-        (tmp_path / name).mkdir(parents=True)
-    (tmp_path / "mine" / "mine.sens").touch()
-    (tmp_path / "scene0009_00").touch()  # a file is no scan
-    names = [path.name for path in find_scans(tmp_path)]
-    assert names == ["mine", "scene0000_00", "scene0000_01", "scene0001_00", "scene0002_00"]
-    train, val = tmp_path / "train.txt", tmp_path / "val.txt"
-    train.write_text("scene0000_01\nscene0000_00\nscene0700_00\n\n")
-    val.write_text("scene0001_00\r\n")
-    split_of, missing = split_scans(names, train, val)
-    assert split_of == dict(zip(names[1:4], ("train", "train", "test"), strict=True))
-    assert list(split_of) == sorted(split_of) and missing == ["scene0700_00"]
-    assert split_scans(names, None, val)[0] == {"scene0001_00": "test"}
 
 
 # -- One scan --------------------------------------------------------------------------------------
@@ -225,24 +191,6 @@ def painted(scan, reader, *rectangles):
         image[y1:y2, x1:x2] = value
     write_zip(scan.path("_2d-instance-filt.zip"), {"0.png": png(image)})
     return replace(reader, image_size=(60, 80)).prepare(task_of(scan), None), image
-
-
-def test_the_shell_touches_everything_and_hides_nothing(scan, reader):
-    """The floor (1) lies around bed (2) and chair (3); the backpack (4) stands at the chair."""
-    scan.write()
-    room, image = painted(
-        scan,
-        reader,
-        (1, 0, 0, 80, 60),
-        (2, 5, 10, 30, 40),
-        (3, 50, 10, 60, 40),
-        (4, 60, 20, 70, 30),
-    )
-    assert room.views.sides_clear.tolist() == [[[True] * 4, [True, True, False, True]]]
-    assert room.views.mask_pixels.tolist() == [[750, 300]]
-    np.testing.assert_array_equal(room.views.instance_ids[0] == 3, image == 4)
-    np.testing.assert_array_equal(room.views.instance_ids[0] == 0, image <= 1)
-    np.testing.assert_array_equal(room.views.stuff[0], (image == 1) * STUFF.index("floor"))
 
 
 def test_ids_without_an_object_hide_and_are_told(scan, reader):
