@@ -27,6 +27,9 @@ JUNK: list[Any] = [
 ]  # fmt: skip
 """Values that replace others in files."""
 
+WORDS = ("99", "-9", "0", "nan", "1e999", "x", "-1", "9" * 400, "", "\ufffd", "#", "= =", "\0")
+"""Words that replace others in texts."""
+
 _READER = """
 import importlib.util, json, resource, sys
 from pathlib import Path
@@ -67,6 +70,21 @@ def damaged_bytes(data: bytes, rng: np.random.Generator) -> bytes:
             for at in rng.integers(0, len(data), int(rng.integers(1, 8))):
                 changed[at] = rng.integers(256)
     return bytes(changed)
+
+
+def damaged_words(text: str, rng: np.random.Generator) -> bytes:
+    """With another word somewhere, a line gone or doubled, or damaged bytes."""
+    if rng.random() < 0.3:
+        return damaged_bytes(text.encode(), rng)
+    lines = text.split("\n")
+    at = rng.integers(len(lines))
+    if rng.random() < 0.2:
+        lines[at : at + 1] = [lines[at]] * (2 * int(rng.integers(2)))
+    else:
+        words = lines[at].split(" ")
+        words[rng.integers(len(words))] = WORDS[rng.integers(len(WORDS))]
+        lines[at] = " ".join(words)
+    return "\n".join(lines).encode()
 
 
 def places(data: Any) -> Iterator[tuple[Any, Any]]:
