@@ -10,7 +10,13 @@ from torch.testing import assert_close
 
 from sceneprior.core.views import as_views, images_of_split
 from sceneprior.paper import fit_image
-from sceneprior.paper.fit_image import FitSchedule, decode_images, fit_latents_to_images, view_loss
+from sceneprior.paper.fit_image import (
+    FitSchedule,
+    decode_images,
+    fit_latents_to_images,
+    refuse_crowds,
+    view_loss,
+)
 
 SHORT = FitSchedule(steps=12, drop_at=8, patience=0)
 
@@ -69,15 +75,14 @@ def test_masks_without_a_number_are_told_at_once(trained, views, start, monkeypa
         fit_latents_to_images(trained, views, start, replace(SHORT, steps=1))
 
 
-def test_more_objects_than_the_prior_generates(trained, views, start):
+def test_more_objects_than_the_prior_generates(trained, views):
     many = torch.arange(7) % views.is_object.shape[1]
+    of_objects = ("boxes", "visible", "sides_clear")
     crowded = replace(
         views,
         object_class=views.object_class[:, many],
         is_object=torch.ones(4, 7, dtype=torch.bool),
-        boxes=views.boxes[:, :, many],
-        visible=views.visible[:, :, many],
-        sides_clear=views.sides_clear[:, :, many],
+        **{name: getattr(views, name)[:, :, many] for name in of_objects},
     )
     with refused("paper/more objects than generated"):
-        fit_latents_to_images(trained, crowded, start)
+        refuse_crowds(trained, crowded)

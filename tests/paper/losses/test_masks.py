@@ -1,17 +1,13 @@
-"""The mask term: gate, averages, gradients, certain pixels; and the losses of each room alone."""
+"""The mask term: gate, averages, gradients, certain pixels."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import pytest
 import torch
 from references import losses as by_hand
-from torch import Tensor
-from torch.testing import assert_close
 
-from sceneprior.core.cameras import Boxes2D
-from sceneprior.paper.losses import layout_losses, mask_loss, mean_of_objects
+from sceneprior.paper.losses import mask_loss
 from sceneprior.paper.matching import match_objects
-from sceneprior.paper.settings import LossConfig
 
 
 def masks(batch, seed=0, sharp=1.0):
@@ -93,33 +89,3 @@ def test_certain_masks_pull_no_harder_than_doubtful_ones(batch):
         assert not leaf.grad[..., :1, :1].any()
         # Other pixels: rendered between 0 and 0.95 of a number from torch.rand.
         assert 0 < leaf.grad.abs().max() < 10
-
-
-def only(thing, room: int):
-    """The same batch, of one room."""
-    changes = {
-        item.name: getattr(thing, item.name)[room : room + 1]
-        for item in fields(thing)
-        if isinstance(getattr(thing, item.name), Tensor)
-    }
-    return replace(thing, **changes)
-
-
-def test_layout_terms(batch):
-    weights = LossConfig(occlusion_slack=0.3)
-    found, _ = layout_losses(batch.scenes, batch.boxes, batch.views, weights, None)
-    for room in range(3):
-        boxes = Boxes2D(*(part[room : room + 1] for part in batch.boxes))
-        one = (only(batch.scenes, room), boxes, only(batch.views, room))
-        alone, _ = layout_losses(*one, weights, "first_n")
-        assert alone.keys() - {"completeness"} == found.keys()
-        for name, value in found.items():
-            assert value.shape == (3,)
-            assert_close(value[room], alone[name], rtol=1e-6, atol=1e-9)
-
-
-def test_a_room_without_anything_that_counts_is_zero():
-    values = torch.tensor([[1.0, 3.0], [5.0, 7.0]])
-    counted = torch.tensor([[True, True], [False, False]])
-    assert mean_of_objects(values, counted, per_room=True).tolist() == [2.0, 0.0]
-    assert mean_of_objects(values, counted).item() == 2.0
