@@ -75,7 +75,7 @@ def efficientnet_lite0_features(
         scaled = ((small - 127) / 128).contiguous(memory_format=torch.channels_last)
         return network.extract_features(scaled).mean((2, 3))
 
-    return _in_chunks(images, features, EFFNET_LITE0["dimensions"])
+    return _in_chunks(images, features)
 
 
 @lru_cache(maxsize=1)
@@ -116,7 +116,7 @@ def inception_features(
             raise _not_inception(torchscript_path, f"it returned shape {tuple(answer.shape)}")
         return answer.float()
 
-    return _in_chunks(images, features, INCEPTION["dimensions"])
+    return _in_chunks(images, features)
 
 
 def check_inception(torchscript_path: Path) -> None:
@@ -150,7 +150,7 @@ def _torchscript(path: Path) -> Any:
         raise _not_inception(path, str(error).strip().splitlines()[0]) from None
 
 
-def _in_chunks(images: np.ndarray, features: Callable[[Tensor], Tensor], width: int) -> np.ndarray:
+def _in_chunks(images: np.ndarray, features: Callable[[Tensor], Tensor]) -> np.ndarray:
     rows = []
     with single_threaded(), torch.inference_mode():
         for start in range(0, len(images), CHUNK):
@@ -159,7 +159,7 @@ def _in_chunks(images: np.ndarray, features: Callable[[Tensor], Tensor], width: 
             padded[: len(chunk)] = chunk
             tensor = torch.from_numpy(padded.transpose(0, 3, 1, 2).copy())
             rows.append(features(tensor)[: len(chunk)].numpy())
-    return np.concatenate(rows) if rows else np.zeros((0, width), dtype=np.float32)
+    return np.concatenate(rows)
 
 
 SIZE_PX = 224
@@ -202,9 +202,7 @@ class Drawing:
         fid = {} if self.inception is None else {"fid": INCEPTION | file_digest(self.inception)}
         return {"fd_effnet_lite0": EFFNET_LITE0, **fid}
 
-    def features(
-        self, scenes: Iterable[Scene], on_progress: Callable[[int], object] = lambda _: None
-    ) -> Features:
+    def features(self, scenes: Iterable[Scene], on_progress: Callable[[int], object]) -> Features:
         """Draw scenes from above, a few at a time, and compute the networks' features.
 
         The calling thread draws, and one thread per processor runs the networks; the features are

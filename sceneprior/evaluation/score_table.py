@@ -95,9 +95,9 @@ def wide_console() -> Console:
     return console
 
 
-def print_scores(scores: dict[str, Any], console: Console | None = None) -> None:
+def print_scores(scores: dict[str, Any]) -> None:
     """Print the table of a result, and the protocol's main entries below it."""
-    console = console or wide_console()
+    console = wide_console()
     split = scores.get("protocol", {}).get("split")
     title = "Rooms for use" if split is None else f"Synthesis against {split} rooms"
     table = Table(title=title, box=box.SIMPLE_HEAD, caption=_caption(scores))
