@@ -6,12 +6,11 @@ draw nothing (prep-scannet) should not spend.
 
 import abc
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
 from sceneprior.core.cameras import Camera, Pinhole, to_camera
-from sceneprior.core.scene import Mesh
+from sceneprior.core.scene import Mesh, join_meshes
 from sceneprior.render.offscreen.zbuffer import sky_light
 
 EVEN = 0.2
@@ -60,20 +59,20 @@ class Renderer(abc.ABC):
         pictures look the same everywhere.
         """
         height, width = image_size
-        soup = _join(meshes)
-        face_index, depth_m = _draw(soup, camera, (2 * height, 2 * width), supersampling=2)
-        light = _face_light(soup, camera)
+        joined, mesh_of_face = _join(meshes)
+        face_index, depth_m = _draw(joined, camera, (2 * height, 2 * width), supersampling=2)
+        light = _face_light(joined, camera)
         if shadowed:
-            light = np.where(soup.mesh_of_face < shadowed, light, light**EVEN)
-        palette = np.asarray(colors, dtype=np.float64).reshape(-1, 3)[soup.mesh_of_face]
+            light = np.where(mesh_of_face < shadowed, light, light**EVEN)
+        palette = np.asarray(colors, dtype=np.float64).reshape(-1, 3)[mesh_of_face]
         palette = np.concatenate([palette * light[:, None], [(0, 0, 0)]])  # -1 is the last row
         picture = palette[face_index]
         if shadowed and isinstance(camera, Pinhole):
             # Computed at half the resolution, because this light changes slowly.
-            casting = soup.mesh_of_face < shadowed
+            casting = mesh_of_face < shadowed
             here = np.append(casting, False)[face_index[::2, ::2]]
             depth_m = np.where(here, depth_m[::2, ::2], np.inf)
-            light = sky_light(soup.vertices, soup.faces[casting], camera, depth_m)
+            light = sky_light(joined.vertices_m, joined.faces[casting], camera, depth_m)
             picture *= light.repeat(2, axis=0).repeat(2, axis=1)[..., None]
         fine = picture.reshape(height, 2, width, 2, 3)
         behind = np.broadcast_to(np.asarray(background), (height, width, 3))[:, None, :, None]
@@ -90,36 +89,22 @@ class SoftwareRenderer(Renderer):
     def instance_ids_of_views(
         self, meshes: Sequence[Mesh], cameras: Sequence[Camera], image_size: tuple[int, int]
     ) -> np.ndarray:
-        soup = _join(meshes)
+        joined, mesh_of_face = _join(meshes)
         images = np.empty((len(cameras), *image_size), dtype=np.uint16)
         for image, camera in zip(images, cameras, strict=True):
-            image[...] = _draw(soup, camera, image_size, labels=soup.mesh_of_face)[0] + 1
+            image[...] = _draw(joined, camera, image_size, labels=mesh_of_face)[0] + 1
         return images
 
 
-class _Soup(NamedTuple):
-    """All meshes of a room joined into one."""
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    mesh_of_face: np.ndarray
-
-
-def _join(meshes: Sequence[Mesh]) -> _Soup:
-    starts = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes)])
-    faces = [
-        np.asarray(mesh.faces, np.int32).reshape(-1, 3) + np.int32(start)
-        for mesh, start in zip(meshes, starts, strict=False)
-    ]
-    return _Soup(
-        np.concatenate([np.zeros((0, 3)), *(mesh.vertices_m for mesh in meshes)]),
-        np.concatenate([np.zeros((0, 3), np.int32), *faces]),
-        np.repeat(np.arange(len(meshes)), [len(part) for part in faces]),
-    )
+def _join(meshes: Sequence[Mesh]) -> tuple[Mesh, np.ndarray]:
+    """All meshes of a room joined into one, and the mesh of each face."""
+    nothing = Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+    lengths = [len(mesh.faces) for mesh in meshes]
+    return join_meshes([nothing, *meshes]), np.repeat(np.arange(len(meshes)), lengths)
 
 
 def _draw(
-    soup: _Soup,
+    mesh: Mesh,
     camera: Camera,
     image_size: tuple[int, int],
     supersampling: int = 1,
@@ -136,15 +121,15 @@ def _draw(
         scale = supersampling / camera.metres_per_pixel
         projection = (scale, scale, image_size[1] / 2, image_size[0] / 2)
     return rasterize(
-        soup.vertices, soup.faces, camera.world_to_camera, projection, image_size,
+        mesh.vertices_m, mesh.faces, camera.world_to_camera, projection, image_size,
         isinstance(camera, Pinhole), labels,
     )  # fmt: skip
 
 
-def _face_light(soup: _Soup, camera: Camera) -> np.ndarray:
+def _face_light(mesh: Mesh, camera: Camera) -> np.ndarray:
     """Brightness of each face in [0.4, 1]: ambient light, and a lamp slightly above the camera."""
     world_to_camera = np.asarray(camera.world_to_camera, dtype=np.float64)
-    corners = to_camera(soup.vertices, world_to_camera)[soup.faces]
+    corners = to_camera(mesh.vertices_m, world_to_camera)[mesh.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     if isinstance(camera, Pinhole):
