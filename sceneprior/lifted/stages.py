@@ -54,7 +54,6 @@ class LiftedStage(LatentStage):
         with full_precision(self.device):
             matches = match_lifted(scenes, rooms, self.loss.match_box)
             losses = lifted_losses(scenes, rooms, matches, self.completeness_target)
-            assert rooms.looks is not None, "on_fit_start has found them"
             known = matches._replace(valid=matches.valid & (rooms.looks >= 0))
             targets = self.looks.targets(rooms.looks.clamp(min=0))
             losses["shape"] = shape_code_loss(scenes, known, *targets)

@@ -36,6 +36,7 @@ def rooms(torch_rng) -> LiftedRooms:
         is_object=is_object,
         is_lifted=is_object & torch.tensor([[True, True, False], [True, True, True], [True] * 3]),
         boxes_m=torch.rand(3, 3, 6, generator=torch_rng, dtype=torch.float64) * 3,
+        looks=torch.full((3, 3), -1),
     )
 
 
@@ -95,10 +96,7 @@ def test_the_terms_are_their_definitions(scenes, rooms):
 
 
 def test_rooms_without_objects_have_no_loss_and_no_nan(scenes, rooms):
-    none = LiftedRooms(
-        rooms.room_index, rooms.object_class * 0, rooms.is_object & False,
-        rooms.is_lifted & False, rooms.boxes_m,
-    )  # fmt: skip
+    none = rooms.changed(torch.zeros_like)
     losses = lifted_losses(scenes, none, match_lifted(scenes, none), "first_n")
     assert losses["box"] == 0 and losses["class"] == 0 and losses["completeness"] == 0
 

@@ -60,7 +60,7 @@ class LiftedRooms(Batch):
     """True if the object's box is known, because some view shows the object."""
     boxes_m: Float[Tensor, "rooms objects 6"]
     """Axis-aligned boxes in the room frame: centre x, y, z, then full extents."""
-    looks: Int[Tensor, "rooms objects"] | None = None
+    looks: Int[Tensor, "rooms objects"]
     """Look (prototype * 8 + pose) nearest to the lifted shape (`lifted/prototypes.py`); -1 if there
     is none."""
     room_ids: tuple[str, ...] = ()
@@ -134,6 +134,7 @@ class LiftedDataset(RoomDataset):
             is_object=self._padded(np.ones(len(self.object_classes), dtype=bool)),
             is_lifted=self._padded(self.boxes.explained > 0),
             boxes_m=self._padded(np.hstack(self.boxes[:2]).astype(np.float32)),
+            looks=self._padded(np.full(len(self.object_classes), -1), -1),
         )
 
     def _padded(self, values: np.ndarray, value: int = 0) -> Tensor:
@@ -193,7 +194,7 @@ class LiftedDataset(RoomDataset):
         return np.where(self.usable, looks, -1)
 
     def assign_prototypes(self, prototypes: Prototypes) -> None:
-        """Assign a look to every object; batches have no looks before this.
+        """Assign a look to every object; no object has one before this.
 
         The prototypes should come from the checkpoint, if there is one: recomputed on another
         processor, they may differ.
@@ -216,17 +217,14 @@ class LiftedDataset(RoomDataset):
         batch = self._rooms.changed(lambda part: part[rows // self.rotations])
         is_object = batch.is_object & shown[:, None]
         widest = max(int(is_object.sum(dim=1).max()), 1)
-        looks = batch.looks
-        if looks is not None:
-            turned = turn_posed(looks.clamp(min=0), quarters, torch.zeros_like(shown))
-            looks = turned.where(looks >= 0, -1)[:, :widest]
+        turned = turn_posed(batch.looks.clamp(min=0), quarters, torch.zeros_like(shown))
         return LiftedRooms(
             room_index=rows,
             object_class=(batch.object_class * is_object)[:, :widest],
             is_object=is_object[:, :widest],
             is_lifted=(batch.is_lifted & is_object)[:, :widest],
             boxes_m=turn_boxes(batch.boxes_m, quarters)[:, :widest],
-            looks=looks,
+            looks=turned.where(batch.looks >= 0, -1)[:, :widest],
             room_ids=tuple(self.plain_ids[row // self.rotations] for row, _ in draws),
         )
 

@@ -5,6 +5,7 @@ import pytest
 import trimesh
 from parts_of_rooms import CORNER, TABLE, boxes, rays_of
 
+from sceneprior.core.boxes import turn_grids
 from sceneprior.core.parts import (
     CYLINDER,
     MOST_CORNERS,
@@ -16,6 +17,8 @@ from sceneprior.core.parts import (
 from sceneprior.lifted.lifting import RayPool
 from sceneprior.lifted.lifting.part_fit import fit_parts
 from sceneprior.lifted.lifting.part_loss import RayFit, area_table, stability
+from sceneprior.lifted.lifting.prototype_fitting import explain_rays, fit_prototypes
+from sceneprior.lifted.prototypes import POSES, Prototypes, pose_rotation, turn_of, turned_extents
 
 MARGIN, CELLS = 1.1, 32
 
@@ -91,3 +94,33 @@ def test_a_round_bench_keeps_its_outline():
     vertices, faces = surface_of_parts(found)
     mesh = trimesh.Trimesh(vertices, faces)
     assert mesh.is_volume and mesh.volume == pytest.approx(np.pi / 4, rel=0.08)
+
+
+def test_objects_in_all_poses_teach_one_kind_and_are_known_again_by_their_rays():
+    """A corner in all eight poses, and two tables."""
+    hull = filled_cells(CORNER, CELLS, MARGIN)
+    hulls = [turn_grids(hull[None], *turn_of(pose))[0] for pose in range(POSES)]
+    hulls += [filled_cells(TABLE, CELLS, MARGIN)] * 2
+    pools = []
+    for pose in range(POSES):
+        pool, back = rays_of(CORNER, 800, pose), pose_rotation(pose).T
+        pools.append(RayPool(pool.starts @ back, pool.spans @ back, pool.hits))
+    pools += [rays_of(TABLE, 800, 8 + seed) for seed in range(2)]
+    rays = RayPool(*(np.stack(part) for part in zip(*pools, strict=True)))
+    size_m = np.array([[1.2, 0.8, 0.6]])
+    sizes_m = np.concatenate(
+        [*(turned_extents(size_m, pose) for pose in range(POSES)), size_m, size_m]
+    )
+    classes = np.array([1] * POSES + [2] * 2)
+    items, usable = np.array([0, 8]), np.ones(10, bool)
+    parts = fit_prototypes(items, np.stack(hulls), rays, sizes_m, classes, usable, ~usable, MARGIN)
+    for found, true in zip(parts, (CORNER, TABLE), strict=True):
+        ours, wanted = (filled_cells(each, CELLS, MARGIN) for each in (found, true))
+        assert (ours & wanted).sum() > 0.85 * (ours | wanted).sum()
+    grids = np.stack([filled_cells(each, CELLS, MARGIN) for each in parts])
+    kinds = Prototypes(parts, grids, sizes_m[items], classes[items], np.ones(2, bool))
+    looks = explain_rays(kinds, rays, sizes_m, classes, MARGIN)
+    assert looks[:POSES].tolist() == list(range(POSES))
+    assert (looks[POSES:] // POSES == 1).all()
+    nobody = explain_rays(kinds, rays, sizes_m, np.full(10, 3), MARGIN)
+    assert (nobody == -1).all(), "no prototype of this class"
