@@ -1,8 +1,10 @@
 """Scenes that another method may have made."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import pytest
 from toy_metrics import without_classifiers
 
@@ -19,6 +21,17 @@ def scenes(toy_shards, tmp_path_factory) -> Path:
     rooms = reference_scenes(toy_shards, "train", limit=4)
     plain = [replace(room.without_meshes(), name=f"room_{k}") for k, room in enumerate(rooms)]
     write_scenes(plain, folder)
+    return folder
+
+
+@pytest.fixture
+def bare(toy_shards, tmp_path) -> Path:
+    """The toy shards without their 3D ground truth."""
+    folder = shutil.copytree(toy_shards, tmp_path / "bare")
+    for path in folder.glob("*/*.h5"):
+        with h5py.File(path, "a") as file:
+            for group in file["rooms"].values():
+                del group["ground_truth"]
     return folder
 
 

@@ -5,7 +5,6 @@ import re
 import shutil
 from dataclasses import replace
 
-import h5py
 import numpy as np
 import pytest
 
@@ -64,16 +63,11 @@ def test_a_run_whose_rooms_are_copies_is_warned_of_wherever_it_draws(command, to
 
 
 def test_a_run_without_3d_truth_has_a_page_and_scores_from_views(
-    command, toy_shards, toy_run, tmp_path
+    command, toy_shards, bare, toy_run, tmp_path
 ):
-    shutil.copytree(toy_shards, tmp_path / "bare")
-    for path in (tmp_path / "bare").glob("*/*.h5"):
-        with h5py.File(path, "a") as file:
-            for group in file["rooms"].values():
-                del group["ground_truth"]
     shutil.copytree(toy_run, tmp_path / "run")
     config = tmp_path / "run" / "config.yaml"
-    config.write_text(config.read_text().replace(str(toy_shards), str(tmp_path / "bare")))
+    config.write_text(config.read_text().replace(str(toy_shards), str(bare)))
     status, _, errors = command("report", "--run", "run")
     assert status == 0, errors
     page = (tmp_path / "run" / "report.html").read_text()
