@@ -45,7 +45,7 @@ def _stopped() -> NoReturn:
 
 
 def _failed(error: Exception) -> NoReturn:
-    from sceneprior.apps.failures import sentence_of
+    from sceneprior.core.errors import sentence_of
 
     if (sentence := sentence_of(error)) is not None:
         print(f"Error: {sentence}", file=sys.stderr)

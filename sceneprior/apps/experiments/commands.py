@@ -23,8 +23,7 @@ from typing import Any
 import torch
 
 from sceneprior.apps.config import load_config
-from sceneprior.apps.failures import sentence_of
-from sceneprior.core.errors import InputError
+from sceneprior.core.errors import InputError, sentence_of
 from sceneprior.core.files import only_writer, read_json, write_json
 
 Main = Callable[[list[str]], int | None]

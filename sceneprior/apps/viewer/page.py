@@ -131,7 +131,7 @@ class Page:
                 f"/room/object_{row}", np.asarray(mesh.vertices_m), mesh.faces, color=tuple(color),
                 flat_shading=True, side="double",
             )  # fmt: skip
-            node.on_click(lambda _, row=row: self.safely(lambda: self._toggle(row)))
+            node.on_click(self._toggler(row))
             self._nodes.append(node)
             is_kept, (x, y, z) = row in self.shown.kept, item.center_m
             if display.names or is_kept:
@@ -179,10 +179,14 @@ class Page:
             points.append(np.insert(shell.outline_m, 1, height_m, axis=1))
         return np.concatenate(points)
 
-    def _toggle(self, item: int) -> None:
-        """Keep an object, or release it."""
-        if item < len(self.shown.scene.objects):
-            self.show(self.shown.toggled(item))
+    def _toggler(self, item: int) -> Callable[[Any], None]:
+        """What a click on an object does: keep it, or release it."""
+
+        def toggle() -> None:
+            if item < len(self.shown.scene.objects):
+                self.show(self.shown.toggled(item))
+
+        return lambda _: self.safely(toggle)
 
     def _pointed(self, point: Point, how: str) -> None:
         source = self.source

@@ -91,7 +91,9 @@ def plan_rooms(
     frames, uniform = numbers.split([5 * RECTANGLES, slots], dim=1)
     floor = conditions.floor
     if floor is None:
-        tried_m = _drawn_rectangles(sampler, frames)
+        choice, *normal = frames.unflatten(1, (RECTANGLES, 5)).unbind(dim=-1)
+        noise = torch.special.ndtri(torch.stack(normal, dim=-1).clamp(1e-6, 1 - 1e-6))
+        tried_m = sampler.rectangles(choice, noise)
         needed = torch.cat([known.object_class[known.is_object], required])
         needed_m2 = float(sampler.footprints_m2[needed].sum()) / FULL_SHARE
         enough_m2 = needed_m2 if len(required) else 0.0
@@ -137,14 +139,6 @@ def _given(conditions: Conditions, slots: int) -> PosedRooms:
         boxes_m[0, row] = torch.tensor([*item.center_m, *item.size_m])
     is_object = torch.arange(slots)[None] < known
     return PosedRooms(labels, is_object, boxes_m, looks=torch.zeros_like(labels))
-
-
-def _drawn_rectangles(
-    sampler: RoomSampler, uniform: Float[Tensor, "rooms numbers"]
-) -> Float[Tensor, "rooms tries 4"]:
-    choice, *normal = uniform.unflatten(1, (RECTANGLES, 5)).unbind(dim=-1)
-    noise = torch.special.ndtri(torch.stack(normal, dim=-1).clamp(1e-6, 1 - 1e-6))
-    return sampler.rectangles(choice, noise)
 
 
 def holding(

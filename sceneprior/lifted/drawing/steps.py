@@ -119,8 +119,10 @@ class Proposal(NamedTuple):
 
     def rows(self, rows: Int[Tensor, " fewer"]) -> "Proposal":
         """Some of these objects."""
-        own = (part[rows] for part in self[1:5])
-        return Proposal(self.sampler, *own, self.state.rows(rows))
+        return Proposal(
+            self.sampler, self.label[rows], self.look[rows], self.size_m[rows],
+            self.bottom_m[rows], self.state.rows(rows),
+        )  # fmt: skip
 
     def boxes_m(self, place_m: Float[Tensor, "some 2"]) -> Float[Tensor, "some 6"]:
         """Boxes of the objects at places (x, z)."""

@@ -51,9 +51,9 @@ def _read_objects(objects: Any) -> tuple[SceneObject, ...]:
     return tuple(found)
 
 
-def _part(schema: Any) -> Any:
+def _part(schema: Any) -> PlainValidator:
     """A part that is kept as plain data, with the type that its JSON Schema shows."""
-    return Annotated[Any, PlainValidator(_plain, json_schema_input_type=schema)]
+    return PlainValidator(_plain, json_schema_input_type=schema)
 
 
 class RoomRequest(BaseModel):
@@ -65,13 +65,15 @@ class RoomRequest(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
 
-    floor: _part(str | list[tuple[float, float]] | None) = None
+    floor: Annotated[Any, _part(str | list[tuple[float, float]] | None)] = None
     """`4x3` (metres along x and z), or corners [x, z] in order; see `read_floor`."""
-    openings: _part(str | list[dict[str, Any] | str] | None) = None
+    openings: Annotated[Any, _part(str | list[dict[str, Any] | str] | None)] = None
     """Doors and windows, such as `door,window@north`; see `read_openings`."""
     ceiling_m: Annotated[float, Field(strict=True)] | None = None
     """Height of the ceiling."""
-    want: _part(str | dict[str, int | str | list[dict[str, str | int | None]]] | None) = None
+    want: Annotated[
+        Any, _part(str | dict[str, int | str | list[dict[str, str | int | None]]] | None)
+    ] = None
     """Wishes: a sentence (`read_sentence`), or a mapping or text with numbers of objects by class
     (`read_wishes`)."""
     objects: Annotated[

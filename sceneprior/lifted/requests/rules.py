@@ -103,9 +103,10 @@ class PlacementRules:
         """
         allowed = np.ones(len(candidates.back), dtype=bool)
         reason = ""
+        tops_m = candidates.boxes_m[:, 1] + candidates.boxes_m[:, 4] / 2
         for name, passed in {
             "a wall behind it": backed_by_walls(self.shape, candidates, rectangles_m),
-            "room below the ceiling": self._below_ceiling(candidates),
+            "room below the ceiling": tops_m <= (self.shape.ceiling_m or math.inf) + 0.01,
             "distance from a door": self._leaves_free("door", label, candidates),
             "distance from a window": self._leaves_free("window", label, candidates),
         }.items():
@@ -129,12 +130,6 @@ class PlacementRules:
         if self._paths is None:
             return np.ones(len(furniture.back), dtype=bool)
         return self._paths.reached(furniture.boxes_m, self._needs_access[furniture.object_class])
-
-    def _below_ceiling(self, candidates: Furniture) -> Bool[np.ndarray, " candidates"]:
-        if self.shape.ceiling_m is None:
-            return np.ones(len(candidates.back), dtype=bool)
-        tops_m = candidates.boxes_m[:, 1] + candidates.boxes_m[:, 4] / 2
-        return np.asarray(tops_m <= self.shape.ceiling_m + 0.01)
 
     def _leaves_free(
         self, kind: str, label: int, candidates: Furniture

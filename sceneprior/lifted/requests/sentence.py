@@ -156,7 +156,7 @@ class _Token(NamedTuple):
 
 def _meanings(known: Sequence[str]) -> dict[str, tuple[str, Any]]:
     """The kind and the value of each phrase; later entries override earlier ones."""
-    nouns = {name.replace("_", " "): (name,) for name in known}
+    nouns: dict[str, tuple[str, ...]] = {name.replace("_", " "): (name,) for name in known}
     nouns |= {noun: classes for noun, classes in NOUNS.items() if noun not in known}
     nouns |= {opening: (opening,) for opening in OPENINGS}
     labels = {

@@ -174,7 +174,7 @@ def read_wishes(want: Any) -> Wishes | None:
         entries = [_ENTRY.fullmatch(part) for part in re.split("[,;]", want)]
         if not all(entries):
             return None
-        pairs = [entry.groups() for entry in entries if entry]
+        pairs = [(entry[1], entry[2]) for entry in entries if entry]
         want = dict(pairs)
         if len(want) < len(pairs):
             ((label, _),) = Counter(label for label, _ in pairs).most_common(1)

@@ -144,48 +144,29 @@ class PairwisePotentials(nn.Module):
             look_shown: Encoding of every look; it ends with the logarithms of the extents.
             backs: Side of every prototype's back; see `side_of`.
         """
-        sides = side_of(torch.arange(len(look_shown), device=label.device), backs)
-        return (
-            self.directions(label, before, backs)[:, sides]
-            + self.repeats(label, before, len(look_shown))
-            + self.sizes(label, counts, look_shown)
-        )
-
-    def directions(
-        self, label: Int[Tensor, " rooms"], before: PosedRooms, backs: Int[Tensor, " prototypes"]
-    ) -> Float[Tensor, "rooms 4"]:
-        """Scores of the directions of the object's back: low z, low x, high z and high x. They are
-        sums over the objects already placed."""
         assert before.looks is not None
+        here, looks = before.is_object, len(look_shown)
+        # Directions: the back may point to low z, low x, high z or high x.
         sides = torch.arange(QUARTERS, device=label.device)
         turned = (side_of(before.looks, backs).unsqueeze(-1) - sides) % QUARTERS
-        extents = before.boxes_m[..., [3, 5]].where(before.is_object.unsqueeze(-1), 1.0)
+        extents = before.boxes_m[..., [3, 5]].where(here.unsqueeze(-1), 1.0)
         along_x = (extents[..., :1].log() - extents[..., 1:].log()).clamp(-MOST_LOG, MOST_LOG)
         along = torch.where(sides % 2 == 1, along_x, -along_x)
         features = torch.stack([turned == 0, turned == 2, turned % 2 == 1, along], -1)
         table = self.direction_table[label.unsqueeze(1), before.object_class]
-        table = table * before.is_object.unsqueeze(-1)
-        return torch.einsum("rosf,rof->rs", features.to(table), table)
-
-    def repeats(
-        self, label: Int[Tensor, " rooms"], before: PosedRooms, looks: int
-    ) -> Float[Tensor, "rooms looks"]:
-        """Scores of the looks whose prototype another object of the class has; 0 for the others."""
-        assert before.looks is not None
-        same = before.is_object & (before.object_class == label.unsqueeze(1))
+        table = table * here.unsqueeze(-1)
+        directions = torch.einsum("rosf,rof->rs", features.to(table), table)
+        # Repeats: looks whose prototype another object of the class has.
+        same = here & (before.object_class == label.unsqueeze(1))
         prototypes = F.one_hot(before.looks // POSES, looks // POSES) * same.unsqueeze(-1)
         repeated = prototypes.sum(dim=1).clamp(max=1).repeat_interleave(POSES, dim=1)
-        return self.repeat_table[label].unsqueeze(1) * repeated
-
-    def sizes(
-        self,
-        label: Int[Tensor, " rooms"],
-        counts: Float[Tensor, "rooms classes"],
-        look_shown: Float[Tensor, "looks shown"],
-    ) -> Float[Tensor, "rooms looks"]:
-        """Scores of the looks' footprints, given how many objects of each class the room has."""
+        # Sizes: the looks' footprints, given how many objects of each class the room has.
         reached = counts.unsqueeze(-1) >= torch.arange(1, MANY + 1).to(counts)
         table = self.size_table[label]
         wanted = torch.einsum("rcm,rcmf->rf", reached.to(table), table)
         x, z = look_shown[:, -3], look_shown[:, -1]
-        return wanted @ torch.stack([x + z, (x - z).abs()])
+        return (
+            directions[:, side_of(torch.arange(looks, device=label.device), backs)]
+            + self.repeat_table[label].unsqueeze(1) * repeated
+            + wanted @ torch.stack([x + z, (x - z).abs()])
+        )

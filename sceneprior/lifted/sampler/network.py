@@ -209,7 +209,14 @@ class RoomSampler(nn.Module):
     ) -> EncoderState:
         """Encode the objects placed so far, in any order, from their `tokens`, and the counts of
         each class still to come."""
-        query = self.query + self.summary_embedding(self.summary(before, coming, rectangle_m))
+        # Features that attention could only obtain by counting: the number of objects of each
+        # class, placed and still to come, and the gaps between the furniture and each side of the
+        # rectangle, which are small in a finished room.
+        low, high = rectangle_sides(rectangle_m)
+        furnished = before.is_object.any(dim=1, keepdim=True)
+        gaps = gaps_m(before, rectangle_m).where(furnished, torch.cat([high - low] * 2, dim=-1))
+        summary = torch.cat([self.counts(before), coming, fourier_features(gaps)], dim=-1)
+        query = self.query + self.summary_embedding(summary)
         shown = self.rectangle_embedding(fourier_features(rectangle_m))
         features = torch.cat([query.unsqueeze(1), shown.unsqueeze(1), tokens], dim=1)
         features = self.dropout(features)
@@ -218,22 +225,6 @@ class RoomSampler(nn.Module):
             features = layer(features, src_key_padding_mask=nothing)
         features = self.norm(features)
         return EncoderState(before, rectangle_m, symmetry, coming, features[:, 0])
-
-    def summary(
-        self,
-        before: PosedRooms,
-        coming: Float[Tensor, "rooms classes"],
-        rectangle_m: Float[Tensor, "rooms 4"],
-    ) -> Float[Tensor, "rooms summary"]:
-        """Features that attention could only obtain by counting: the number of objects of each
-        class, placed and still to come, and the gaps between the furniture and each side of the
-        rectangle, which are small in a finished room."""
-        counts = self.counts(before)
-        furnished = before.is_object.any(dim=1, keepdim=True)
-        low, high = rectangle_sides(rectangle_m)
-        whole = torch.cat([high - low] * 2, dim=-1)
-        gaps = gaps_m(before, rectangle_m).where(furnished, whole)
-        return torch.cat([counts, coming, fourier_features(gaps)], dim=-1)
 
     def look_logits(
         self, state: EncoderState, label: Int[Tensor, " rooms"]

@@ -83,12 +83,12 @@ def teach(sampler: RoomSampler, rooms: SamplerRooms) -> None:
     mixture = GaussianMixture(RECTANGLES, reg_covar=LEAST_VARIANCE, random_state=0).fit(
         torch.cat([centre, extents.log()], dim=-1).numpy()
     )
-    for buffer, values in (
+    for buffer, fitted in (
         (sampler.rectangle_logits, np.log(mixture.weights_)),
         (sampler.rectangle_means, mixture.means_),
         (sampler.rectangle_factors, np.linalg.cholesky(mixture.covariances_)),
     ):
-        buffer.copy_(torch.from_numpy(values))
+        buffer.copy_(torch.from_numpy(fitted))
 
 
 def mean_by_prototype(
