@@ -2,13 +2,14 @@
 room and to the objects already placed."""
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from sceneprior.core.boxes import QUARTERS
+from sceneprior.core.boxes import QUARTERS, turn_boxes
 from sceneprior.core.mixtures import FIRST_SCALE, LogisticMixture
 from sceneprior.lifted.prototypes import PARTS, PosedRooms, turn_posed
 from sceneprior.lifted.sampler.frames import (
@@ -17,7 +18,6 @@ from sceneprior.lifted.sampler.frames import (
     side_of,
     turn_places,
     turn_rectangles,
-    turned_rooms,
 )
 
 SHOWN = PARTS**3 + 3
@@ -310,10 +310,11 @@ class Placement(nn.Module):
         """
         back = side_of(look, backs)
         quarters = -back % QUARTERS
-        before, rectangle_m = turned_rooms(before, quarters), turn_rectangles(rectangle_m, quarters)
-        looks = before.looks
-        assert looks is not None
-        own_look = turn_posed(look[:, None], quarters, quarters < 0)[:, 0]
+        rectangle_m, not_mirrored = turn_rectangles(rectangle_m, quarters), quarters < 0
+        assert before.looks is not None
+        looks = turn_posed(before.looks, quarters, not_mirrored)
+        before = replace(before, boxes_m=turn_boxes(before.boxes_m, quarters), looks=looks)
+        own_look = turn_posed(look[:, None], quarters, not_mirrored)[:, 0]
         size_m = torch.where((quarters % 2 == 1)[:, None], size_m.flip(-1), size_m)
         centre, extents = before.boxes_m.split(3, dim=-1)
         bottoms_m = centre[..., 1:2] - extents[..., 1:2] / 2
