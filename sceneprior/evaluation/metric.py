@@ -187,7 +187,7 @@ class Comparison:
     columns: dict[str, dict[str, Estimate]] = field(default_factory=dict)
     """Estimates computed so far, by set and key; generated rooms come last."""
 
-    def trained_on(self, rooms: RoomSet) -> bool:
+    def is_training_set(self, rooms: RoomSet) -> bool:
         """True if the rooms are training rooms themselves."""
         return any(rooms.scenes[0] is other for other in self.train)
 

@@ -137,7 +137,7 @@ def layout_classifier_accuracy(rooms: RoomSet, comparison: Comparison) -> Estima
 
     scenes, counts = rooms.scenes, rooms.counts
     real = [*comparison.train, *comparison.val]
-    if comparison.trained_on(rooms):
+    if comparison.is_training_set(rooms):
         # To score the real training rooms, the classifier separates two halves of the real rooms.
         order = np.random.default_rng((comparison.seed, 3)).permutation(len(real))
         halves = np.array_split(order, 2)

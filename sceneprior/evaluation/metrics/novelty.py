@@ -162,7 +162,7 @@ def near_copy_threshold(training: Sequence[Scene]) -> float:
     ),
 )  # fmt: skip
 def _nearest(rooms: RoomSet, comparison: Comparison) -> Estimate:
-    own = comparison.trained_on(rooms)
+    own = comparison.is_training_set(rooms)
     return mean_of_rooms(nearest_distances(rooms.scenes, comparison.train, own), rooms.counts)
 
 
@@ -172,7 +172,7 @@ def _nearest(rooms: RoomSet, comparison: Comparison) -> Estimate:
 def _nearest_decoded(rooms: RoomSet, comparison: Comparison) -> Estimate | None:
     if not comparison.decoded:
         return None
-    own = comparison.trained_on(rooms)
+    own = comparison.is_training_set(rooms)
     return mean_of_rooms(nearest_distances(rooms.scenes, comparison.decoded, own), rooms.counts)
 
 
@@ -188,7 +188,7 @@ def _nearest_decoded(rooms: RoomSet, comparison: Comparison) -> Estimate | None:
     ),
 )  # fmt: skip
 def _near_copy_share(rooms: RoomSet, comparison: Comparison) -> Estimate:
-    known, own = [*comparison.train, *comparison.decoded], comparison.trained_on(rooms)
+    known, own = [*comparison.train, *comparison.decoded], comparison.is_training_set(rooms)
     distances = nearest_distances(rooms.scenes, known, own, as_copies=True)
     return mean_of_rooms(distances < comparison.near_copy_m, rooms.counts, 1.0)
 
