@@ -118,7 +118,7 @@ def read_own_image(
                 "displaced objects by 34 cm (by 1.1 m with --camera-height), and --gravity by 7 "
                 "cm; give --gravity x,y,z from the phone's accelerometer, or --pose"
             )
-        tilt = np.eye(4) if gravity is None else tilted(read_gravity(gravity))
+        tilt = np.eye(4) if gravity is None else read_gravity(gravity)
         poses = [tilt @ level_camera(height, side) for height in heights_m for side in range(sides)]
     else:
         poses = [read_pose(pose)]
@@ -171,8 +171,14 @@ def level_camera(height_m: float, quarter: int = 0) -> np.ndarray:
 
 
 def read_gravity(text: str) -> np.ndarray:
-    """Unit vector of gravity in camera axes (x right, y down, z forward), from `x,y,z` of any
-    length."""
+    """(4, 4) transform that tilts a level camera: the smallest rotation from +y to gravity.
+
+    `text` is gravity's direction in camera axes (x right, y down, z forward), `x,y,z` of any
+    length. The transform is applied after the level camera's `world_to_camera`.
+
+    >>> (read_gravity("0,1.5,2")[:3, :3] @ [0, 1, 0]).round(6).tolist()
+    [0.0, 0.6, 0.8]
+    """
     try:
         down = np.array([float(part) for part in text.split(",")])
     except ValueError:
@@ -182,26 +188,13 @@ def read_gravity(text: str) -> np.ndarray:
             f"--gravity {text} is not a direction; expected x,y,z in camera axes (x right, y down, "
             "z forward): 0,1,0 for a level camera, 0,0.9,0.4 for one that looks down a little."
         )
-    down = down / np.linalg.norm(down)
-    if down[1] < -UPSIDE_DOWN:
+    x, y, z = down / np.linalg.norm(down)
+    if y < -UPSIDE_DOWN:
         raise InputError(
             f"--gravity {text} points up in the image: the camera is upside down. Expected camera "
             "axes x right, y down, z forward."
         )
-    return down
-
-
-def tilted(down: np.ndarray) -> np.ndarray:
-    """(4, 4) transform that tilts a level camera: the smallest rotation from +y to `down`.
-
-    `down` is the unit vector of gravity in camera axes. The transform is applied after the level
-    camera's `world_to_camera`.
-
-    >>> (tilted(np.array([0.0, 0.6, 0.8]))[:3, :3] @ [0, 1, 0]).round(6).tolist()
-    [0.0, 0.6, 0.8]
-    """
-    x, y, z = down
-    # Rodrigues' formula for rotating (0, 1, 0) to `down` about their common normal, (z, 0, -x).
+    # Rodrigues' formula for rotating (0, 1, 0) to gravity about their common normal, (z, 0, -x).
     cross = np.array([[0, x, 0], [-x, 0, -z], [0, z, 0]])
     pose = np.eye(4)
     pose[:3, :3] += cross + cross @ cross / (1 + y)

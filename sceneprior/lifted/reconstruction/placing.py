@@ -141,7 +141,18 @@ def place_objects(
     """
     heights_m = bottom_m + sizes_m[:, 1] / 2
     shape_m = points * sizes_m[:, None]
-    place_m = starting_places(heights_m, masks)
+    # Start where the ray through the middle of each mask reaches the object's height.
+    left, top, right, bottom = masks.extents[:, :4].unbind(dim=1)
+    middle = torch.stack([right - left, bottom - top], dim=-1) / 2
+    cameras = (masks.world_to_camera[:, None], masks.intrinsics[:, None])
+    ray = pixel_rays(middle[:, None, None], *cameras)[:, 0, 0]
+    eye_m = camera_centers(masks.world_to_camera)
+    level = ray[:, ::2].norm(dim=1).clamp(min=1e-6)
+    along = (heights_m - eye_m[:, 1]) / ray[:, 1].abs().clamp(min=1e-6).copysign(ray[:, 1])
+    near_m, far_m = REACH_M
+    there = (along * level > near_m) & (along * level < far_m)
+    along = torch.where(there, along, USUAL_M / level)
+    place_m = eye_m[:, ::2] + along[:, None] * ray[:, ::2]
     best, energy = place_m, torch.full_like(heights_m, torch.inf)
     held = DAMPING * torch.eye(2)
     border = points.new_tensor(DIRECTIONS).clamp(min=0).sum(dim=1)
@@ -167,22 +178,3 @@ def place_objects(
         length_m = move_m.norm(dim=1, keepdim=True)
         place_m = place_m + move_m * (LONGEST_STEP_M / length_m.clamp(min=LONGEST_STEP_M))
     return Placed(torch.stack([best[:, 0], heights_m, best[:, 1]], dim=-1), energy)
-
-
-def starting_places(
-    heights_m: Float[Tensor, " objects"], masks: Outlines
-) -> Float[Tensor, "objects 2"]:
-    """Position (x, z) at which the ray through the middle of each mask reaches the object's
-    height."""
-    left, top, right, bottom = masks.extents[:, :4].unbind(dim=1)
-    middle = torch.stack([right - left, bottom - top], dim=-1) / 2
-    cameras = (masks.world_to_camera[:, None], masks.intrinsics[:, None])
-    ray = pixel_rays(middle[:, None, None], *cameras)[:, 0, 0]
-    eye_m = camera_centers(masks.world_to_camera)
-    level = ray[:, ::2].norm(dim=1).clamp(min=1e-6)
-    steep = ray[:, 1].abs().clamp(min=1e-6).copysign(ray[:, 1])
-    along = (heights_m - eye_m[:, 1]) / steep
-    near_m, far_m = REACH_M
-    there = (along * level > near_m) & (along * level < far_m)
-    along = torch.where(there, along, USUAL_M / level)
-    return eye_m[:, ::2] + along[:, None] * ray[:, ::2]
