@@ -31,7 +31,6 @@ from data_prep.inspection.pictures import draw_view
 from sceneprior.apps.viewer.explorer import make_map
 from sceneprior.core.cameras import project
 from sceneprior.core.classes import class_colors, label_set
-from sceneprior.core.dataset import FlatViews
 from sceneprior.core.observations import RoomViews, thinned
 from sceneprior.core.proxies import icosphere, place
 from sceneprior.core.shards import Shard
@@ -220,10 +219,13 @@ def draw_geodesic(prior: TrainedPrior, path: Path) -> None:
 def views_of(room: RoomViews, numbers: list[int]) -> SceneViews:
     """Some views of a room, as the losses read them."""
     assert room.instance_ids is not None, "read_room(images=True)"
-    chosen, none = torch.tensor([numbers]), torch.tensor([0])
+    labels = torch.from_numpy(room.object_class).long()[None]
+    names = ("world_to_camera", "intrinsics", "boxes", "visible", "sides_clear")
     return SceneViews(
-        room_index=none,
-        **FlatViews.of([room]).gather(none, chosen, none, len(room.object_class)),
+        room_index=torch.tensor([0]),
+        object_class=labels,
+        is_object=torch.ones_like(labels, dtype=torch.bool),
+        **{name: torch.from_numpy(getattr(room, name)[numbers])[None] for name in names},
         image_size=room.image_size,
         instance_ids=torch.from_numpy(room.instance_ids[numbers][:, *thinned(MASK_STEP)])[None],
     )
