@@ -36,14 +36,3 @@ def test_ratios_leave_out_what_weighs_nothing_and_stay_in_their_range():
     np.testing.assert_equal(estimate.values, [0.5, 1.0, np.nan, 0.5])
     assert estimate.interval() == pytest.approx([0.2625, 0.7375])
     assert Estimate(np.array([0.9, 0.0, 1.0]), 0.0, 1.0).interval() == pytest.approx([0.425, 1.0])
-
-
-def test_estimates_are_compared_resample_by_resample():
-    a = Estimate(np.array([0.6, 0.5, 0.7]), 0.0, 1.0)
-    b = Estimate(np.array([0.3, 0.25, 0.0]), 0.0, 1.0)
-    over, minus = a.combined(b, np.divide), a.combined(b, np.subtract)
-    assert over.value == 2 and over.interval() == pytest.approx([2.0, 2.0])  # 0.7 / 0 is nothing
-    np.testing.assert_allclose(minus.values, [0.3, 0.25, 0.7])
-    nothing = Estimate(np.full(3, np.nan))
-    for estimate in (a.combined(nothing, np.divide), a.combined(Estimate(np.zeros(3)), np.divide)):
-        assert estimate.value is None and estimate.interval() is None

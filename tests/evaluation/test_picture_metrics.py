@@ -60,14 +60,6 @@ def test_frechet_distance_is_torchmetrics(two_sets):
     assert frechet_distance(*two_sets) == pytest.approx(expected, rel=1e-6)
 
 
-def test_counts_stand_for_repeated_rows(two_sets, rng):
-    a, b = two_sets
-    counts_a, counts_b = rng.integers(0, 3, size=len(a)), rng.integers(0, 3, size=len(b))
-    longer_a, longer_b = a.repeat(counts_a, axis=0), b.repeat(counts_b, axis=0)
-    expected = frechet_distance(longer_a, longer_b)
-    assert frechet_distance(a, b, counts_a, counts_b) == pytest.approx(expected, rel=1e-9)
-
-
 def test_kernel_distance_is_torchmetrics_where_a_subset_is_the_whole_set(two_sets):
     a, b = two_sets[0][:30], two_sets[1]
     theirs = KernelInceptionDistance(Plain(), subsets=1, subset_size=30, normalize=True)
