@@ -68,22 +68,6 @@ def test_kernel_distance_is_torchmetrics_where_a_subset_is_the_whole_set(two_set
     assert kernel_distances(a, b, once, once)[0] == pytest.approx(mean.item(), rel=1e-9)
 
 
-def test_counts_stand_for_repeated_rows_of_kernels(two_sets, rng):
-    a, b = two_sets
-    counts_a, counts_b = rng.integers(0, 3, size=len(a)), rng.integers(0, 3, size=len(b))
-    longer_a, longer_b = a.repeat(counts_a, axis=0), b.repeat(counts_b, axis=0)
-    ones = (np.ones((1, len(rows)), int) for rows in (longer_a, longer_b))
-    expected = kernel_distances(longer_a, longer_b, *ones)[0]
-    # A row repeated is a pair with itself in the longer set, and none where it is counted.
-    own = [
-        (counts * (counts - 1)) @ ((rows**2).sum(1) / 12 + 1) ** 3 / (n * (n - 1))
-        for rows, counts, n in ((a, counts_a, len(longer_a)), (b, counts_b, len(longer_b)))
-    ]
-    got = kernel_distances(a, b, counts_a[None], counts_b[None])
-    assert got.shape == (1,) and sum(own) > 0
-    assert got[0] == pytest.approx(expected, rel=1e-9)
-
-
 @pytest.mark.parametrize(("n", "m"), [(40, 30), (2, 30), (3, 2)])
 def test_precision_and_recall_are_their_definition(two_sets, n, m):
     a, b = two_sets[0][:n], two_sets[1][:m]
