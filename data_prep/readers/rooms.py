@@ -250,17 +250,17 @@ def _truth(
     places = np.zeros((len(objects), 4, 4))
     places[:, range(3), range(3)] = sizes_m
     places[:, :3, 3], places[:, 3, 3] = centers_m, 1
-    scan, models = room.scan, {}
+    scan, models = room.scan, dict[str, Mesh]()
     model_ids = [""] * len(objects)
-    for row, k in enumerate([] if scan is None else objects):
-        assert scan is not None
-        surface = surface_of(scan.mesh, scan.parts[k])
-        if surface is not None:
-            points = scan.mesh.vertices_m[scan.parts[k]]
-            center_m = (points.min(axis=0) + points.max(axis=0)) / 2
-            model_ids[row] = scan.model_ids[k]
-            models[model_ids[row]] = Mesh(surface.vertices_m - center_m, surface.faces)
-            places[row, range(3), range(3)] = 1
+    if scan is not None:
+        for row, k in enumerate(objects):
+            surface = surface_of(scan.mesh, scan.parts[k])
+            if surface is not None:
+                corners = surface.vertices_m.min(axis=0), surface.vertices_m.max(axis=0)
+                model_ids[row] = scan.model_ids[k]
+                models[model_ids[row]] = Mesh(surface.vertices_m - sum(corners) / 2, surface.faces)
+                places[row, range(3), range(3)] = 1
+    assert room.floor_m is not None, "set when the floor is found"
     truth = RoomGroundTruth(
         object_class=room.object_class[objects],
         centers_m=centers_m.astype(np.float32),

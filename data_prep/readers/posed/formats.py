@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from data_prep.readers.posed.coco import CocoMasks, PanopticPngs
 from data_prep.readers.posed.masks import MaskFormat
@@ -51,7 +52,7 @@ def mask_format(folder: Path, given: str | None) -> type[MaskFormat]:
     return (found or [IdPngs])[0]
 
 
-def read_formats(names: Iterable[str]) -> dict[str, str]:
+def read_formats(names: Iterable[str]) -> dict[str, Any]:
     """Parse the values of `--from`: at most one format of `poses` and one of `masks`."""
     given: dict[str, str] = {}
     for name in names:
