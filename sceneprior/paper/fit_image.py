@@ -118,7 +118,7 @@ def fit_latents_to_images(
     trained: TrainedPrior,
     views: SceneViews,
     start: Float[Tensor, "images width"],
-    schedule: FitSchedule = SCHEDULES["paper"],
+    schedule: FitSchedule,
     masks: bool = True,
 ) -> Fit:
     """Fit one latent per image with RMSProp on its view loss, and return the best latent found.
