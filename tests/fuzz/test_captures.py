@@ -17,7 +17,6 @@ import pytest
 from capture_files import timestamp
 from front_files import FrontFolder, bedroom
 from mutating import MUTATIONS, damaged_bytes, damaged_json, damaged_words
-from pycocotools.mask import encode
 from toy_formats import FORMATS
 
 from data_prep.engine.source import pool
@@ -25,7 +24,6 @@ from data_prep.front.furnished import ModelBank
 from data_prep.front.houses import read_house
 from data_prep.front.recipe import broken_rule, load_recipe
 from data_prep.readers.posed.reader import Posed
-from sceneprior.core.coco import read_coco
 from sceneprior.core.errors import InputError
 
 pytestmark = pytest.mark.slow
@@ -133,24 +131,6 @@ def test_damaged_files_of_each_format(tmp_path, name, file):
 
     read()
     check_all(lambda rng: path.write_bytes(damaged(path, whole, rng)), read)
-
-
-def test_coco_json(tmp_path):
-    path = tmp_path / "a.json"
-    packed = encode(np.asfortranarray(np.eye(30, 40, dtype=np.uint8)))
-    rows = [
-        {"id": 1, "image_id": 1, "category_id": 1, "segmentation": [[1, 1, 9, 1, 9, 9]]},
-        {"id": 2, "image_id": 1, "category_id": 2, "iscrowd": 1,
-         "segmentation": {"size": [30, 40], "counts": [100, 50, 1050]}},
-        {"id": 3, "image_id": 1, "category_id": 2, "bbox": [1, 2, 3, 4],
-         "segmentation": {"size": [30, 40], "counts": packed["counts"].decode()}},
-    ]  # fmt: skip
-    data = {
-        "images": [{"id": 1, "height": 30, "width": 40}],
-        "categories": [{"id": 1, "name": "bed"}, {"id": 2, "name": "chair"}],
-        "annotations": rows,
-    }
-    check_all(lambda rng: path.write_text(damaged_json(data, rng)), lambda: read_coco(path))
 
 
 def test_front_house_json(tmp_path):
