@@ -79,7 +79,7 @@ class Page:
         self._lock = threading.RLock()
         self._newest: Callable[[], None] | None = None
         self._follower = ThreadPoolExecutor(1)
-        self._nodes: list[Any] = []
+        self._nodes: dict[str, Any] = {}
         floor_m = max(FLOOR_M, 2 * float(np.abs(self._room_points()[:, [0, 2]]).max()))
         self._grid = server.scene.add_grid(
             "/grid", floor_m, floor_m, plane="xz", position=(0.0, -0.005, 0.0),
@@ -111,18 +111,15 @@ class Page:
         """Replace the nodes of the room; objects that the user keeps get an orange box and a
         name."""
         scene, display, add = self.scene, self.display, self.server.scene
-        while self._nodes:
-            self._nodes.pop().remove()
+        before, self._nodes = self._nodes, {}
         is_walled = display.shell == "walls"
         shell = shell_of(scene).inner_meshes() if is_walled else shell_meshes(scene, display.shell)
         self._grid.visible = not shell
-        self._nodes += [
-            add.add_mesh_simple(
-                f"/room/{name}", mesh.vertices_m, mesh.faces, flat_shading=True, side="front",
+        for name, part in shell.items():
+            self._nodes[name] = add.add_mesh_simple(
+                f"/room/{name}", part.vertices_m, part.faces, flat_shading=True, side="front",
                 color=tuple(shell_color(name).tolist()), cast_shadow=False,
-            )
-            for name, mesh in shell.items()
-        ]  # fmt: skip
+            )  # fmt: skip
         for row, (item, color) in enumerate(
             zip(scene.objects, object_colors(scene).tolist(), strict=True)
         ):
@@ -132,19 +129,21 @@ class Page:
                 flat_shading=True, side="double",
             )  # fmt: skip
             node.on_click(self._toggler(row))
-            self._nodes.append(node)
+            self._nodes[f"object_{row}"] = node
             is_kept, (x, y, z) = row in self.shown.kept, item.center_m
             if display.names or is_kept:
-                self._nodes.append(add.add_label(
+                self._nodes[f"name_{row}"] = add.add_label(
                     f"/room/name_{row}", name_and_size(item), anchor="bottom-center",
                     position=(x, y + item.size_m[1] / 2 + 0.05, z),
-                ))  # fmt: skip
+                )  # fmt: skip
             if display.boxes or is_kept:
                 (corners,) = box_corners(scene.centers_m[[row]], scene.sizes_m[[row]])
-                self._nodes.append(add.add_line_segments(
+                self._nodes[f"box_{row}"] = add.add_line_segments(
                     f"/room/box_{row}", corners[np.array(BOX_EDGES)], _KEPT if is_kept else _BOX,
                     thickness=2, thickness_units="screen",
-                ))  # fmt: skip
+                )  # fmt: skip
+        for name in before.keys() - self._nodes.keys():
+            before[name].remove()
 
     def frame(self) -> None:
         """Move all cameras so that everything is visible."""
