@@ -87,8 +87,8 @@ def voxel_loss(scene: Scene) -> Counts:
         for other in range(row + 1, len(plans)):
             height = min(high, spans[other][1]) - max(low, spans[other][0])
             if height > 0 and _area(plan, plans[other]) * height >= LEAST:
-                keys = (voxels(each) @ [1 << 40, 1 << 20, 1] for each in (row, other))
-                shared += len(np.intersect1d(*keys, assume_unique=True))
+                one, two = (voxels(each) @ [1 << 40, 1 << 20, 1] for each in (row, other))
+                shared += len(np.intersect1d(one, two, assume_unique=True))
     oob_m3, mbl_m3 = outside * PITCH_M**3, shared * PITCH_M**3
     return {
         "respace_oob_litres": (1000 * oob_m3, 1.0),
