@@ -109,7 +109,7 @@ def sens(
     frames: int = 1000, color_bytes: int = 150_000, depth_bytes: int = 250_000
 ) -> dict[str, float]:
     """Peak memory of `prep-scannet` on a long recording."""
-    sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "data_prep" / "scannet"))
+    sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "data_prep" / "readers"))
     from scan_files import Box, ScanFolder, frame_header, png, sens_header, write_table, write_zip
 
     boxes = [Box("bed", (0, 0, 0), (2, 1.6, 0.6)), Box("chair", (2.5, 2, 0), (3, 2.5, 0.9))]

@@ -34,7 +34,7 @@ from data_prep.readers.frames import Y_UP
 from data_prep.readers.scan_files import read_annotated_mesh
 from sceneprior.core.classes import STUFF, label_set
 
-sys.path.append(str(Path(__file__).parents[1] / "tests" / "data_prep" / "scannet"))
+sys.path.append(str(Path(__file__).parents[1] / "tests" / "data_prep" / "readers"))
 
 from scan_files import TABLE, Box, ScanFolder, write_table
 

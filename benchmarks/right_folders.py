@@ -33,8 +33,7 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.observations import RoomViews
 from sceneprior.core.shards import iterate_rooms, read_index
 
-TESTS = Path(__file__).parents[1] / "tests" / "data_prep"
-sys.path += [str(TESTS / "posed"), str(TESTS / "scannet")]
+sys.path.append(str(Path(__file__).parents[1] / "tests" / "data_prep" / "readers"))
 
 import capture_files as tools  # noqa: E402
 from colmap_files import SCALE, write_colmap  # noqa: E402
