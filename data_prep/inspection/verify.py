@@ -232,18 +232,19 @@ def _check_shard(
 ) -> list[RoomCheck]:
     """Check every room of a shard, or only `only`; an unreadable shard is one problem."""
     name = str(path.relative_to(folder))
+    whole = RoomCheck(name, "", convention=usual)
     checks: list[RoomCheck] = []
     try:
         with Shard(path) as shard:
             if shard.label_set != label_set_name:
                 said = f"the shard is labelled '{shard.label_set}', index.json says"
-                checks.append(RoomCheck(name, "", problems=(f"{said} '{label_set_name}'",)))
+                checks.append(replace(whole, problems=(f"{said} '{label_set_name}'",)))
             for room_id in shard.room_ids:
                 if only is None or room_id == only:
                     check = RoomCheck(name, room_id, convention=conventions.get(room_id, usual))
                     checks.append(_check_room(shard, folder, check))
     except ShardError as error:
-        checks.append(RoomCheck(name, "", problems=(str(error).removesuffix("."),)))
+        checks.append(replace(whole, problems=(str(error).removesuffix("."),)))
     return checks
 
 
