@@ -35,9 +35,9 @@ from sceneprior.core.shards import iterate_rooms, read_index
 
 sys.path.append(str(Path(__file__).parents[1] / "tests" / "data_prep" / "readers"))
 
-import capture_files as tools  # noqa: E402
-from colmap_files import SCALE, write_colmap  # noqa: E402
-from posed_files import PosedRoom, Thing  # noqa: E402
+import capture_files as tools
+from colmap_files import SCALE, write_colmap
+from posed_files import PosedRoom, Thing
 
 OPENGL = np.diag([1.0, -1, -1, 1])
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
