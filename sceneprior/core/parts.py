@@ -230,3 +230,14 @@ class Stretch(NamedTuple):
             places = np.concatenate([[0], np.cumsum(lengths * scale)]) - 0.5
             moved[:, axis] = np.interp(points[:, axis], knots, places)
         return moved
+
+
+def stretched_parts(parts: Parts, own: Stretch, new_size_m: Float[np.ndarray, "3"]) -> Parts:
+    """Stretch parts, in the frame of the object's box, to a box of the extents `new_size_m`."""
+    corners = parts.ends.transpose(0, 2, 1).reshape(-1, 3)
+    points = np.concatenate([corners, np.insert(parts.outline, 1, 0.0, axis=1)])
+    corners, outline = np.split(own.moved(points, new_size_m), [len(corners)])
+    return parts._replace(
+        ends=corners.reshape(-1, 2, 3).transpose(0, 2, 1),
+        outline=parts.outline if np.array_equal(parts.outline, SQUARE) else outline[:, ::2],
+    )

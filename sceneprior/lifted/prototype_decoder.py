@@ -16,9 +16,11 @@ from sceneprior.core.parts import (
     KIND_NAMES,
     MOST_CORNERS,
     MOST_PARTS,
+    SQUARE,
     Parts,
     Stretch,
     filled_cells,
+    stretched_parts,
     surface_of_parts,
     whole_box,
 )
@@ -32,13 +34,7 @@ from sceneprior.lifted.prototypes import (
     turn_of,
     turned_extents,
 )
-from sceneprior.lifted.shape_morphing import (
-    appearances_of,
-    blend_parts,
-    matched_parts,
-    posed_parts,
-    stretched_parts,
-)
+from sceneprior.lifted.shape_morphing import appearances_of, blend_parts, matched_parts
 from sceneprior.paper.decoders import ShapeModule, ShapeModuleConfig
 
 
@@ -290,7 +286,7 @@ class PrototypeDecoder(ShapeModule):
             # Mirroring inverts the faces: reverse their corners.
             faces = surface.faces[:, ::-1].copy() if turn_of(pose)[1] else surface.faces
             size_m = self.sizes_m[prototype].double().cpu().numpy()
-            posed = posed_parts(parts, pose)
+            posed = _posed_parts(parts, pose)
             stretch = Stretch.of(posed, turned_extents(size_m[None], pose)[0])
             self._shapes[look] = Posed(posed, Mesh(vertices, faces), stretch)
         return self._shapes[look]
@@ -326,3 +322,16 @@ def _padded(outline: Float[np.ndarray, "corners 2"]) -> Float[Tensor, "most 2"]:
     """An outline of `MOST_CORNERS` corners, its last one repeated."""
     missing = MOST_CORNERS - len(outline)
     return torch.from_numpy(np.pad(outline, ((0, missing), (0, 0)), mode="edge")).float()
+
+
+def _posed_parts(parts: Parts, pose: int) -> Parts:
+    """The parts of a prototype in a pose, with mirror images as separate parts."""
+    across = pose_rotation(pose)
+    kind, ends = zip(*parts.solids(), strict=True)
+    outline = parts.outline
+    if not np.array_equal(outline, SQUARE):
+        outline = outline @ across[::2, ::2].T
+        outline = outline[::-1] if turn_of(pose)[1] else outline  # stays counter-clockwise
+    return Parts(
+        np.array(kind), np.zeros(len(kind), np.int64), np.sort(across @ np.stack(ends)), outline
+    )

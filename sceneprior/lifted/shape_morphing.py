@@ -1,5 +1,5 @@
-"""Looks along a path between rooms: where on the path each look is shown, its parts, and blends of
-two looks in which each solid of one becomes a solid of the other."""
+"""Looks along a path between rooms: where on the path each look is shown, and blends of two looks
+in which each solid of one becomes a solid of the other."""
 
 from typing import NamedTuple
 
@@ -7,8 +7,7 @@ import numpy as np
 import shapely
 from jaxtyping import Bool, Float, Int
 
-from sceneprior.core.parts import BOX, SQUARE, Parts, Stretch
-from sceneprior.lifted.prototypes import pose_rotation, turn_of
+from sceneprior.core.parts import BOX, SQUARE, Parts
 
 HOLD = 0.125
 """Minimum share of the path that a look between two others must hold to be shown. A smaller value
@@ -60,30 +59,6 @@ def appearances_of(
         shown = [(ends[0], looks[steps[0]]), *between, (ends[1], looks[steps[-1]])]
         found.append(Appearance(*map(np.array, zip(*shown, strict=True))))
     return found
-
-
-def posed_parts(parts: Parts, pose: int) -> Parts:
-    """The parts of a prototype in a pose, with mirror images as separate parts."""
-    across = pose_rotation(pose)
-    kind, ends = zip(*parts.solids(), strict=True)
-    outline = parts.outline
-    if not np.array_equal(outline, SQUARE):
-        outline = outline @ across[::2, ::2].T
-        outline = outline[::-1] if turn_of(pose)[1] else outline  # stays counter-clockwise
-    return Parts(
-        np.array(kind), np.zeros(len(kind), np.int64), np.sort(across @ np.stack(ends)), outline
-    )
-
-
-def stretched_parts(parts: Parts, own: Stretch, new_size_m: Float[np.ndarray, "3"]) -> Parts:
-    """Stretch parts, in the frame of the object's box, to a box of the extents `new_size_m`."""
-    corners = parts.ends.transpose(0, 2, 1).reshape(-1, 3)
-    points = np.concatenate([corners, np.insert(parts.outline, 1, 0.0, axis=1)])
-    corners, outline = np.split(own.moved(points, new_size_m), [len(corners)])
-    return parts._replace(
-        ends=corners.reshape(-1, 2, 3).transpose(0, 2, 1),
-        outline=parts.outline if np.array_equal(parts.outline, SQUARE) else outline[:, ::2],
-    )
 
 
 SLIVER = 1e-3
