@@ -69,6 +69,7 @@ def write_front(scenes: Sequence[Scene], folder: Path) -> None:
 def _house(
     scene: Scene, furniture: list[dict[str, Any]], children: list[dict[str, Any]]
 ) -> dict[str, Any]:
+    """A house of one room, with its floor; `children` place the models that `furniture` lists."""
     (x0, z0), (x1, z1) = floor_rectangle(scene)
     plan = floor_plan(floor_polygon(scene) or shapely.box(x0, z0, x1, z1))
     vertices = plan["floor_plan_vertices"]
