@@ -23,6 +23,8 @@ MIN_DEPTH_M = 1e-3
 the authors' code."""
 FIELD_OF_VIEW_DEG = (5.0, 160.0)
 """Plausible fields of view along an image's longer side, from a 400 mm lens to a fisheye."""
+FILLED = 0.92
+"""Share of the window that the points of `framed` may fill."""
 
 
 @dataclass(frozen=True)
@@ -227,3 +229,32 @@ def odd_field_of_view(focal_px: float, image_size: tuple[int, int]) -> str:
         f"a focal length of {focal_px:g} pixels in an image of {image_size[1]} x {image_size[0]} "
         f"sees {seen:.3g} degrees, expected {least:g} to {most:g}; {guess}"
     )
+
+
+def framed(
+    points_m: Float[np.ndarray, "points 3"],
+    forward: Float[np.ndarray, "3"],
+    fov_rad: float,
+    aspect: float,
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Position and target of the nearest camera that sees all points, with y up.
+
+    Args:
+        forward: Viewing direction, not straight up or down.
+        fov_rad: Vertical field of view.
+        aspect: Width-to-height ratio of the window.
+    """
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 1.0, 0.0])
+    right /= np.linalg.norm(right)
+    upward = np.cross(right, forward)
+    depth = points_m @ forward
+    slope = FILLED * np.tan(fov_rad / 2)
+    # A camera at depth -away sees a point if |across - middle| <= slope * (depth + away).
+    middle, away = [], []
+    for across, own in ((points_m @ right, slope * aspect), (points_m @ upward, slope)):
+        high, low = (across - own * depth).max(), (-across - own * depth).max()
+        middle.append((high - low) / 2)
+        away.append((high + low) / 2 / own)
+    eye = middle[0] * right + middle[1] * upward - max(away) * forward
+    return eye, eye + (depth.mean() + max(away)) * forward

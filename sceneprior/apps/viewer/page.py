@@ -24,6 +24,7 @@ from sceneprior.apps.viewer.explorer import (
     name_and_size,
 )
 from sceneprior.core.boxes import BOX_EDGES, box_corners
+from sceneprior.core.cameras import framed
 from sceneprior.core.errors import InputError
 from sceneprior.core.shell import ShellName, shell_meshes, shell_of
 from sceneprior.render.appearance import object_colors, object_mesh, scene_meshes, shell_color
@@ -37,8 +38,6 @@ CORNER = np.array([-0.42, -0.62, -0.66])
 """Viewing direction if only a room is shown, as in the pictures of rooms."""
 FRONT = np.array([0.0, -0.6, -0.8])
 """Viewing direction if a room is shown beside the map, which faces the camera."""
-MARGIN = 0.92
-"""Share of the window that the points may fill."""
 FLOOR_M = 6.0
 """Least side of the floor beside which the board stands."""
 GAP = 0.06
@@ -80,6 +79,8 @@ class Page:
         self._newest: Callable[[], None] | None = None
         self._follower = ThreadPoolExecutor(1)
         self._nodes: dict[str, Any] = {}
+        self._bounds_m = np.zeros((2, 3))
+        """Lowest and highest corner that the cameras show."""
         floor_m = max(FLOOR_M, 2 * float(np.abs(self._room_points()[:, [0, 2]]).max()))
         self._grid = server.scene.add_grid(
             "/grid", floor_m, floor_m, plane="xz", position=(0.0, -0.005, 0.0),
@@ -106,6 +107,9 @@ class Page:
                 if self.board is not None:
                     self.board.mark(shown.scene.latent)
                 self.on_show()
+            points, (low, high) = self._room_points(), self._bounds_m
+            if settled and ((points < low) | (points > high)).any():
+                self.frame()
 
     def _draw(self) -> None:
         """Replace the nodes of the room; objects that the user keeps get an orange box and a
@@ -147,6 +151,8 @@ class Page:
 
     def frame(self) -> None:
         """Move all cameras so that everything is visible."""
+        points = self._room_points()
+        self._bounds_m = np.stack([points.min(axis=0) - 0.05, points.max(axis=0) + 0.05])
         for client in self.server.get_clients().values():
             self._frame(client)
 
@@ -168,8 +174,7 @@ class Page:
         if self.board is not None:
             points, direction = np.concatenate([points, self.board.corners_m()]), FRONT
         with client.atomic():
-            eye, target = framed(points, direction, camera.fov, camera.aspect)
-            camera.position, camera.look_at = eye, target
+            camera.position, camera.look_at = framed(points, direction, camera.fov, camera.aspect)
 
     def _room_points(self) -> Float[np.ndarray, "points 3"]:
         """Vertices of the furniture, and corners of the floor and of the walls if shown."""
@@ -216,35 +221,6 @@ class Page:
             title = "That does not work" if known else f"{type(error).__name__}: please report it"
             for client in self.server.get_clients().values():
                 client.add_notification(title, str(error), color="red", auto_close_seconds=20)
-
-
-def framed(
-    points_m: Float[np.ndarray, "points 3"],
-    forward: Float[np.ndarray, "3"],
-    fov_rad: float,
-    aspect: float,
-) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Position and target of the nearest camera that sees all points, with y up.
-
-    Args:
-        forward: Viewing direction, not straight up or down.
-        fov_rad: Vertical field of view.
-        aspect: Width-to-height ratio of the window.
-    """
-    forward = forward / np.linalg.norm(forward)
-    right = np.cross(forward, [0.0, 1.0, 0.0])
-    right /= np.linalg.norm(right)
-    upward = np.cross(right, forward)
-    depth = points_m @ forward
-    slope = MARGIN * np.tan(fov_rad / 2)
-    # A camera at depth -away sees a point if |across - middle| <= slope * (depth + away).
-    middle, away = [], []
-    for across, own in ((points_m @ right, slope * aspect), (points_m @ upward, slope)):
-        high, low = (across - own * depth).max(), (-across - own * depth).max()
-        middle.append((high - low) / 2)
-        away.append((high + low) / 2 / own)
-    eye = middle[0] * right + middle[1] * upward - max(away) * forward
-    return eye, eye + (depth.mean() + max(away)) * forward
 
 
 class Board:

@@ -15,7 +15,7 @@ from refusals import refused
 
 import sceneprior
 from sceneprior.apps.viewer.explorer import FORMATS, Display, Explorer, Folder, download, make_map
-from sceneprior.core.cameras import look_at
+from sceneprior.core.cameras import FILLED, framed, look_at
 from sceneprior.core.scene import Opening, Scene, SceneObject
 from sceneprior.core.shell import shell_of
 from sceneprior.interchange.export import FORMATS as EXPORT_FORMATS
@@ -41,13 +41,13 @@ ROOM = Scene("mine", "front3d_bedroom", (BED,), FLOOR, openings=(DOOR,))
 @pytest.mark.parametrize("aspect", [0.4, 1.3, 3.0])
 def test_cameras_see_all_points_and_stand_no_further_away_than_they_must(forward, aspect, rng):
     points = rng.uniform([-4, 0, -2], [3, 2.6, 5], (40, 3))
-    eye, target = pages.framed(points, forward, 0.75, aspect)
+    eye, target = framed(points, forward, 0.75, aspect)
     matrix = look_at(eye, target)
     x, y, z = matrix[:3, :3] @ points.T + matrix[:3, 3:]
     assert (z > 0).all()
     slope = np.tan(0.75 / 2)
     filled = max((abs(x) / z).max() / (slope * aspect), (abs(y) / z).max() / slope)
-    assert filled == pytest.approx(pages.MARGIN, abs=1e-9)
+    assert filled == pytest.approx(FILLED, abs=1e-9)
     np.testing.assert_allclose(np.cross(target - eye, forward), 0, atol=1e-9)
 
 
