@@ -130,6 +130,15 @@ def report_csv(lines: Iterable[Line]) -> str:
     return table.getvalue()
 
 
+def _compared(of: str, official: dict[str, int], counts: dict[str, Any]) -> dict[str, Any]:
+    found = {split: count["rooms"] for split, count in counts.items()} | _sums(counts.values())
+    rows = [
+        {"what": what, "expected": count, "found": found[what], "difference": found[what] - count}
+        for what, count in official.items()
+    ]
+    return {"of": of, "rows": rows}
+
+
 @dataclass(frozen=True)
 class Summary:
     """The totals of a job."""
@@ -157,13 +166,15 @@ class Summary:
     @property
     def report(self) -> dict[str, Any]:
         """Contents of `report.json`."""
-        about = {
+        about: dict[str, Any] = {
             "source": self.source.name,
             "room_type": self.source.room_type,
             "label_set": self.source.label_set,
             "renderer": self.renderer,
             "summary": str(self),
         }
+        if self.source.official is not None:
+            about["expected"] = _compared(*self.source.official, self.counts)
         return make_report(self.lines, about)
 
     def __str__(self) -> str:
@@ -215,6 +226,11 @@ def report_tables(report: dict[str, Any]) -> list[Table]:
         make_table(columns, splits),
         make_table(("class", *report["counts"]), classes),
     ]
+    if expected := report.get("expected"):
+        cells = [[*row.values()] for row in expected["rows"]]
+        rows = [(*others, f"{more:+d}" if more else "as expected") for *others, more in cells]
+        titles = ("what", "expected", "found", "difference")
+        tables.append(make_table(titles, rows, expected["of"]))
 
     def add_some(name: str, other: str, rows: list[tuple[str, Any]], more: tuple[str, str]) -> None:
         if rows:

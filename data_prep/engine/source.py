@@ -112,6 +112,7 @@ class Source(Protocol):
         room_type: Type of the rooms; also in the shards' names: `train/<room_type>_0000.h5`.
         draws: True if `prepare` needs a renderer; otherwise it gets None.
         only: Requested part: HOUSE, HOUSE/ROOM or a room id (plan.py); None for everything.
+        official: Origin of official counts and the counts, which the report compares with; or None.
     """
 
     @property
@@ -124,6 +125,8 @@ class Source(Protocol):
     def draws(self) -> bool: ...
     @property
     def only(self) -> str | None: ...
+    @property
+    def official(self) -> tuple[str, dict[str, int]] | None: ...
 
     def settings(self, only: str | None) -> dict[str, Any]:
         """Settings that the shards' bytes depend on, as JSON, without paths.

@@ -42,6 +42,7 @@ class FrontSource:
 
     name: ClassVar = "3d-front"
     draws: ClassVar = True
+    official: ClassVar = None
     front: Path
     future: Path
     recipe: Recipe

@@ -108,6 +108,11 @@ class Reader(ABC):
             "scenes": digest("\n".join(scenes)),
         }
 
+    @property
+    def official(self) -> tuple[str, dict[str, int]] | None:
+        """See `Source.official`."""
+        return None
+
     def official_split(self, scene: str) -> str | None:
         """Split of a scene, if the data set states it in the scene's name."""
         return None

@@ -44,6 +44,7 @@ _ALIGNMENT = re.compile(r"\s*axisAlignment\s*=")
 FULL_SIZE = (968, 1296)
 QUARTER_SIZE = (242, 324)
 """(height, width) of ScanNet's colour frames, and a quarter of it, the paper's rendering size."""
+_OFFICIAL = {"rooms": 1513, "train": 1201, "test": 312, "views": 108_059}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,6 +73,12 @@ class ScanNet(Reader):
         self._check_positive("frame_step")
         if self.masks not in MASK_FILES:
             raise InputError(f"masks is '{self.masks}'; choose {' or '.join(MASK_FILES)}.")
+
+    @property
+    def official(self) -> tuple[str, dict[str, int]] | None:
+        """See `Source.official`: those of the lists, if both are given and all scans are asked."""
+        of = "ScanNet v2 by its lists; views as the paper counts them (section 5)"
+        return (of, _OFFICIAL) if self.train and self.val and self.only is None else None
 
     def options(self) -> dict[str, Any]:
         names = ("frame_step", "max_views", "masks", "image_size")

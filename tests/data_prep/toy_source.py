@@ -23,6 +23,7 @@ class ToySource:
     label_set: str = LABEL_SET
     room_type: str = "toys"
     draws: bool = False
+    official: None = None
     only: str | None = None
 
     def settings(self, only: str | None) -> dict[str, Any]:

@@ -334,6 +334,11 @@ def test_the_command_writes_shards_whose_boxes_project_onto_their_masks(source, 
     made = cli(*words, *lists, "--out", tmp_path / "a")
     assert made.exit_code == 0, made.output
     assert "train 3 rooms, 15 views, 6 objects; test 1 rooms, 5 views, 2 objects" in made.stdout
+    report = json.loads((tmp_path / "a" / "report.json").read_text())
+    assert [(row["what"], row["difference"]) for row in report["expected"]["rows"]] == [
+        ("rooms", 4 - 1513), ("train", 3 - 1201), ("test", 1 - 312), ("views", 20 - 108_059),
+    ]  # fmt: skip
+    assert "-1509" in made.stdout and "ScanNet v2 by its lists" in made.stdout
     checked = cli("inspect", tmp_path / "a", "--verify")
     said = " ".join(checked.stdout.split())
     assert checked.exit_code == 0 and "projected meshes" in said
