@@ -41,7 +41,7 @@ MAY_TOO = {
 
 BUDGET = {
     "data_prep": (12381, 58),
-    "sceneprior/core": (5400, 28),
+    "sceneprior/core": (5431, 28),
     "sceneprior/furniture": (572, 4),
     "sceneprior/render": (4487, 23),
     "sceneprior/training": (866, 5),
@@ -50,7 +50,7 @@ BUDGET = {
     "sceneprior/baselines": (2909, 14),
     "sceneprior/evaluation": (4135, 20),
     "sceneprior/interchange": (903, 5),
-    "sceneprior/apps": (6218, 34),
+    "sceneprior/apps": (6194, 34),
 }
 """Most lines and modules of a folder. They go down freely, and up only in a commit that says what
 it bought and what went for it."""
