@@ -45,7 +45,7 @@ this many pixels."""
 _FIT_PX = 1.5
 """Median gap up to which poses fit the masks. If no correction comes so far, something else is
 wrong, which `inspect --verify` may name; and it cannot be told which masks are wrong."""
-_MOST_AGREE, _LEAST_PAIRS = 0.6, 4
+_MOST_AGAINST, _LEAST_PAIRS = 0.6, 4
 """A mask is wrong if it is too wide for more than this share of the object's other masks, of which
 at least so many can be compared."""
 _DIGITS = 6
@@ -213,7 +213,7 @@ def wrong_masks(outlines: Outlines, gaps: Gaps) -> Bool[np.ndarray, " masks"]:
         too_wide = (known & (wider_px > limit_px[:, None])).any(axis=1)
         np.add.at(told, outlines.pairs[:, mine], known.any(axis=1))
         np.add.at(against, outlines.pairs[:, mine], too_wide)
-    return (told >= _LEAST_PAIRS) & (against > _MOST_AGREE * told)
+    return (told >= _LEAST_PAIRS) & (against > _MOST_AGAINST * told)
 
 
 def find_outlines(seen: Observations, intrinsics: Float[np.ndarray, "views 3 3"]) -> Outlines:

@@ -64,7 +64,8 @@ class EvalOptions:
     """Settings of an evaluation, the same for every method."""
 
     seed: int = 0
-    """Seed for choosing training rooms, the classifiers' folds and the resamples."""
+    """Seed of all that is drawn at random: new rooms, independent and shuffled furniture, training
+    rooms, the classifiers' folds and the resamples."""
     inception: Path | None = None
     """NVIDIA's `inception-2015-12-05.pt`; None leaves the metrics of Inception features out."""
     alexnet: Path | None = None

@@ -311,7 +311,7 @@ def read_pose(path: Path) -> np.ndarray:
     eye_m = camera_centers(pose)
     if eye_m[1] <= 0:
         raise InputError(
-            f"The camera of {path} is {-eye_m[1]:g} m below the floor, which is y = 0; move it, or "
-            "turn the room so that y is up."
+            f"The camera of {path} is {abs(eye_m[1]):g} m below the floor, which is y = 0; move "
+            "it, or turn the room so that y is up."
         )
     return pose

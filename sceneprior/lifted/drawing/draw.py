@@ -1,5 +1,5 @@
 """Rooms drawn by a sampler, as scenes: sequential Monte Carlo over partly furnished rooms, repeated
-until they are whole. A plain room has no conditions and one particle."""
+until they are whole. A plain room has no wishes and one particle."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -56,8 +56,9 @@ class Effort(NamedTuple):
 
 
 PLAIN = Effort(particles=1, attempts=48, attempts_per_plan=16, whole=47, together=32)
-"""Rooms with conditions that are inputs of the network: a rectangle, and given objects."""
+"""For rooms whose conditions are inputs of the network: a rectangle, and given objects."""
 REQUESTED = Effort(particles=6, attempts=12, attempts_per_plan=1, whole=4, together=1)
+"""For rooms with a floor, openings or wishes, which places are checked against."""
 
 
 class SampledRooms(NamedTuple):

@@ -81,7 +81,7 @@ class PlacementRules:
         self._needs_access = needs_access(classes)
         has_door = any(each.kind == "door" for each in shape.openings)
         self._paths = Paths(shape) if has_door else None
-        self._unreached_given = ~self._reached(given)
+        self._given_unreached = ~self._reached(given)
 
     def allowed(
         self,
@@ -120,11 +120,17 @@ class PlacementRules:
             return allowed, reason
         for row in np.flatnonzero(allowed):
             joined = placed.joined(candidates.rows(slice(row, row + 1)))
-            allowed[row] = enough > 0 and self._reached(joined)[len(self._unreached_given) :].all()
+            allowed[row] = enough > 0 and self._all_reached(joined)
             if enough > 0 and not allowed[row]:
                 reason = reason or "a path from a door"
             enough -= int(allowed[row])
         return allowed, reason
+
+    def _all_reached(self, furniture: Furniture) -> bool:
+        """True if a path leads to every object, but for given ones that had none from the start."""
+        reached = self._reached(furniture)
+        reached[: len(self._given_unreached)] |= self._given_unreached
+        return bool(reached.all())
 
     def _reached(self, furniture: Furniture) -> Bool[np.ndarray, " objects"]:
         if self._paths is None:

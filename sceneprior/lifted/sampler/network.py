@@ -92,9 +92,10 @@ class RoomSampler(nn.Module):
 
     A transformer encoder without positional encoding reads the rectangle around the room's
     furniture, the objects placed so far, and a learnt query. The query's output predicts the next
-    object, whose class is already known: first its look, then its size relative to that look and
-    the height of its bottom, then its place (`Placement`), relative to the rectangle, to the
-    floor's middle and to the other objects.
+    object, whose class is already known: first its look, then its size relative to that look, then
+    its place (`Placement`), relative to the rectangle, to the floor's middle and to the other
+    objects. Drawn rooms take a size and a height that training objects with that look have
+    (`draw_size`, `bottom_m`); the head of sizes only takes part in the likelihood.
 
     Training rooms are presented in all their `SYMMETRIES`. The frequency of each look in each pose
     depends on the orientation of the data; it is learnt for untransformed rooms, and transformed

@@ -6,7 +6,14 @@ import pytest
 from sceneprior.core.scene import Opening
 from sceneprior.lifted.requests.floors import Floor, RoomShape, read_floor
 from sceneprior.lifted.requests.relations import Furniture
-from sceneprior.lifted.requests.rules import CELL_M, PATH_M, Paths, backed_by_walls, needs_access
+from sceneprior.lifted.requests.rules import (
+    CELL_M,
+    PATH_M,
+    Paths,
+    PlacementRules,
+    backed_by_walls,
+    needs_access,
+)
 
 DOOR = Opening("door", (-0.45, -1.5), (0.45, -1.5), 0.0, 2.0)
 SHAPE = RoomShape(Floor(read_floor("4x3")), (DOOR,))
@@ -87,3 +94,20 @@ def test_backs_at_the_inner_side_of_an_l_are_no_backs_at_walls():
     boxes = np.array([[1.0, 0.5, 2.5, 1, 1, 1], [4.0, 0.5, 2.5, 1, 1, 1], [1.0, 0.5, 1.5, 1, 1, 1]])
     at_high_z = Furniture(boxes, np.array([1, 1, 1]), np.array([2, 2, 2]), np.zeros((3, 2)))
     assert backed_by_walls(shape, at_high_z, arm).tolist() == [False, True, True]
+
+
+@pytest.mark.parametrize("barred", [False, True])
+def test_new_objects_leave_the_path_to_a_given_one_if_it_has_one(barred):
+    """A given bed at the far side; a given barrier before it may have no path to the bed."""
+    bed, barrier = box(0, 1.0, 1, 1), box(0, -0.1, 4, 0.3)
+    given = furniture([bed, barrier] if barred else [bed])
+    rules = PlacementRules(SHAPE, [], ["bed"], given)
+    rectangles_m = np.array([[0.0, 0.0, 4.0, 3.0]] * 2)
+    places = furniture([box(0, 0.1, 4, 0.2), box(-1.6, -0.9, 0.4, 0.2)])
+    allowed, _ = rules.allowed(0, places, given, [], rectangles_m, enough=2)
+    assert allowed.tolist() == [False, True]
+
+
+def furniture(boxes: list[list[float]]) -> Furniture:
+    count = len(boxes)
+    return Furniture(np.array(boxes), np.zeros(count, int), np.full(count, 1), np.zeros((count, 2)))
