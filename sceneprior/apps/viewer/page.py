@@ -184,7 +184,7 @@ class Page:
         return np.concatenate(points)
 
     def _toggler(self, item: int) -> Callable[[Any], None]:
-        """What a click on an object does: keep it, or release it."""
+        """The answer to a click on an object: keep it, or release it."""
 
         def toggle() -> None:
             if item < len(self.shown.scene.objects):

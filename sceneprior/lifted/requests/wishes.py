@@ -1,4 +1,4 @@
-"""What a requested room must meet: wishes for numbers of objects and their relations, the floor,
+"""Conditions of a requested room: wishes for numbers of objects and their relations, the floor,
 doors and windows, and given objects."""
 
 import math
