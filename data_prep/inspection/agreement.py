@@ -12,7 +12,6 @@ from scipy.spatial import ConvexHull, QhullError
 from data_prep.readers.upright import own_sides
 from sceneprior.core.boxes import BOX_EDGES, box_corners
 from sceneprior.core.cameras import to_camera, to_pixels
-from sceneprior.core.errors import ShardError
 from sceneprior.core.ground_truth import load_model, model_path
 from sceneprior.core.observations import RoomGroundTruth, RoomViews
 
@@ -119,7 +118,7 @@ def true_bodies(
                         f"the 3D box of object {k} differs by {off:.3f} m from the box around its "
                         "placed mesh"
                     )
-            except ShardError as error:
+            except InputError as error:
                 body = None
                 problems.append(str(error).removesuffix("."))
         if body is not None and truth.unoccluded is not None and k < truth.unoccluded.shape[1]:

@@ -23,7 +23,7 @@ from data_prep.inspection.causes import Convention
 from data_prep.inspection.diagnosis import Finding, disagreement, find_mistake, outliers
 from data_prep.inspection.evidence import Evidence, room_evidence, total
 from sceneprior.core.classes import VOID, label_set
-from sceneprior.core.errors import InputError, ShardError
+from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
 from sceneprior.core.observations import RoomGroundTruth, RoomViews, observe
 from sceneprior.core.shard_writing import room_checksum
@@ -243,7 +243,7 @@ def _check_shard(
                 if only is None or room_id == only:
                     check = RoomCheck(name, room_id, convention=conventions.get(room_id, usual))
                     checks.append(_check_room(shard, folder, check))
-    except ShardError as error:
+    except InputError as error:
         checks.append(replace(whole, problems=(str(error).removesuffix("."),)))
     return checks
 
@@ -255,7 +255,7 @@ def _check_room(shard: Shard, folder: Path, check: RoomCheck) -> RoomCheck:
         if shard.has_ground_truth(room_id):
             truth = shard.read_ground_truth(room_id)
         stored = shard.read_checksum(room_id)
-    except ShardError as error:
+    except InputError as error:
         return replace(check, problems=(str(error).removesuffix("."),))
     changed = "its checksum does not match its contents: the file was changed or damaged"
     problems = [changed] * (stored is not None and stored != room_checksum(views, truth))

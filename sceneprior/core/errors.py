@@ -2,15 +2,20 @@
 what to do."""
 
 import errno
+import os
 
 _ADVICE = {
-    errno.ENOSPC: "free space on its disk, or name another folder",
-    errno.EDQUOT: "free space in your quota, or name another folder",
+    errno.EAGAIN: "another program has it open for writing: wait until it has ended. If none has, "
+    "its file system has no locks: set HDF5_USE_FILE_LOCKING=FALSE",
+    errno.ENOLCK: "its file system has no locks: set HDF5_USE_FILE_LOCKING=FALSE",
+    errno.ELOOP: "a symbolic link leads back to itself; name what it shall lead to",
+    errno.ENOSPC: "free space on its disk",
+    errno.EDQUOT: "free space in your quota",
     errno.EFBIG: "its disk, or `ulimit -f`, allows no file of this size",
     errno.EROFS: "name a folder that can be written",
-    errno.EACCES: "change its permissions, or name another folder",
-    errno.EPERM: "change its permissions, or name another folder",
-    errno.ENOENT: "check the path, or name another folder",
+    errno.EACCES: "change its permissions",
+    errno.EPERM: "change its permissions",
+    errno.ENOENT: "check the path",
     errno.ENOTDIR: "a file is where a folder is needed; name another folder",
     errno.EEXIST: "a file is where a folder is needed; name another folder",
     errno.EISDIR: "a folder is where a file is needed; name another file",
@@ -22,6 +27,8 @@ _ADVICE = {
     errno.ESTALE: "its network folder was lost; try again",
 }
 """Advice on operating system errors, by number."""
+_ELSEWHERE = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.ENOENT}
+"""Errors after which the user may also write to another folder."""
 
 
 class InputError(ValueError):
@@ -47,9 +54,19 @@ def sentence_of(error: Exception) -> str | None:
     """The failure and what to do about it in one sentence; None if the error is a bug."""
     if isinstance(error, InputError | FloatingPointError):
         return str(error)
-    if isinstance(error, OSError) and error.errno in _ADVICE:
+    if isinstance(error, OSError) and (error.errno in _ADVICE or error.filename):
+        advice = f"; {_ADVICE[error.errno]}" if error.errno in _ADVICE else ""
+        other = ", or name another folder" if error.errno in _ELSEWHERE else ""
         return (
-            f"{error.filename or 'A file'} cannot be read or written ({error.strerror}); "
-            f"{_ADVICE[error.errno]}."
+            f"{error.filename or 'A file'} cannot be read or written ({error.strerror})"
+            f"{advice}{other}."
         )
     return None
+
+
+def cause_of(error: OSError) -> str:
+    """Why a file cannot be read, and what to do: 'Permission denied: change its permissions'."""
+    if error.errno is None:
+        return " ".join(str(error).split())[:200] or type(error).__name__
+    advice = _ADVICE.get(error.errno) if error.errno != errno.ENOENT else None
+    return os.strerror(error.errno) + (f": {advice}" if advice else "")

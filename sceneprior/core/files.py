@@ -1,21 +1,38 @@
-"""Atomic writes, folder locks, JSON, and checks of file names."""
+"""Files: atomic writes, folder locks, lists of inputs, reading them, and their names."""
 
+import codecs
 import contextlib
+import csv
+import errno
 import fcntl
+import hashlib
+import io
 import json
 import os
 import secrets
+import stat
 from collections.abc import Callable, Iterator
+from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sceneprior.core.errors import InputError
+from sceneprior.core.errors import cause_of as cause_of
+
+if TYPE_CHECKING:
+    import h5py
 
 PART = ".part"
 """Suffix of a file that is still being written."""
 PARTS = f"*.{'[0-9a-f]' * 8}{PART}"
 """Glob pattern of the temporary files of `write_whole`."""
 _LONGEST_NAME = 120
+_MOST_BYTES = 1 << 31
+_MOST_TEXT = 1 << 29
+"""Maximum size of a text in bytes; COCO's largest table has 0.47 GB."""
+_CLUTTER = frozenset(["Thumbs.db", "desktop.ini", "__MACOSX", "@eaDir"])
+"""Names of what Windows, archives of macOS, and network disks add to folders."""
+_NO_LOCKS = frozenset([errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP])
 _TRIAL_BYTES = 2**16
 
 
@@ -150,18 +167,136 @@ def file_stamp(path: Path) -> tuple[int, int]:
     try:
         status = path.stat()
     except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}).") from None
+        raise _unread(path, cause_of(error)) from None
     return status.st_mtime_ns, status.st_size
 
 
-def read_json(path: Path) -> Any:
+def list_files(folder: Path, pattern: str = "*", deep: bool = False) -> list[Path]:
+    """List the files of a folder whose name matches, sorted; `deep` also looks in its folders.
+
+    Dot files such as `._a.png` and `.DS_Store`, and other additions of operating systems, are
+    never inputs: they are left out, with all that lies below such a folder. A folder that is
+    missing has no files.
+
+    Raises:
+        InputError: a folder cannot be listed.
+    """
+    return sorted(path for path, is_folder in _entries(folder, pattern, deep) if not is_folder)
+
+
+def list_folders(folder: Path, pattern: str = "*") -> list[Path]:
+    """List the folders in a folder as `list_files` lists its files."""
+    return sorted(path for path, is_folder in _entries(folder, pattern) if is_folder)
+
+
+def _entries(folder: Path, pattern: str, deep: bool = False) -> Iterator[tuple[Path, bool]]:
+    try:
+        with os.scandir(folder) as listed:
+            entries = [(entry.name, entry.is_dir(), entry.is_symlink()) for entry in listed]
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    except OSError as error:
+        raise InputError(f"{folder} cannot be listed ({cause_of(error)}).") from None
+    for name, is_folder, is_link in entries:
+        if name.startswith(".") or name in _CLUTTER:
+            continue
+        path = Path(folder) / name
+        if fnmatchcase(name, pattern):
+            yield path, is_folder
+        if deep and is_folder and not is_link:  # a link may lead back to its folder
+            yield from _entries(path, pattern, deep)
+
+
+def read_bytes(path: Path, most: int = _MOST_BYTES, hint: str = "") -> bytes:
+    """Read a regular file of at most `most` bytes; `hint` says what to do if that fails.
+
+    Raises:
+        InputError: it cannot be read, is a folder, pipe or device, or is larger.
+    """
+    path = Path(path)
+    try:
+        size = _checked_status(path).st_size
+        if size > most:
+            raise _unread(path, f"it has {size} bytes, expected at most {most}", hint)
+        return path.read_bytes()
+    except OSError as error:
+        raise _unread(path, cause_of(error), hint) from None
+
+
+def _checked_status(path: Path) -> os.stat_result:
+    """Status of a file; pipes would wait for their writer, and devices may have no end."""
+    status = path.stat()
+    if not stat.S_ISREG(status.st_mode) and not stat.S_ISDIR(status.st_mode):
+        raise _unread(path, "it is a pipe or a device", "name a file")
+    return status
+
+
+def _unread(path: Path, reason: str, hint: str = "") -> InputError:
+    return InputError(f"{path} cannot be read ({reason}){'; ' if hint else ''}{hint}.")
+
+
+def read_text(path: Path, most: int = _MOST_TEXT, hint: str = "") -> str:
+    """Read a text as UTF-8, or as UTF-16 by its byte order mark; lines end with a line feed."""
+    content = read_bytes(path, most, hint)
+    wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    try:
+        text = content.decode("utf-16" if wide else "utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise _unread(path, str(error), hint or "save it as UTF-8") from None
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def read_json(path: Path, most: int = _MOST_TEXT, hint: str = "") -> Any:
     """Read a JSON file."""
     try:
-        return json.loads(path.read_bytes())
-    except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}).") from None
+        return json.loads(read_bytes(path, most, hint))
+    except InputError:
+        raise
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path.name} is not JSON ({error}); it may be truncated.") from None
+        advice = hint or "it may be truncated"
+        raise InputError(f"{path.name} is not JSON ({error}); {advice}.") from None
+
+
+def read_table(path: Path, hint: str = "", **dialect: Any) -> list[list[str]]:
+    """Read the rows of a text table; `dialect` holds options of `csv.reader`, such as a tab."""
+    try:
+        return list(csv.reader(io.StringIO(read_text(path, hint=hint)), **dialect))
+    except csv.Error as error:
+        raise _unread(path, str(error), hint) from None
+
+
+def open_hdf5(path: Path, whole: bool = False) -> "h5py.File":
+    """Open an HDF5 file for reading; use it, and read from it, within `hdf5_errors`.
+
+    `whole` says that no program writes to such files in place, as `write_whole` does not: they are
+    read without locks, which many network folders lack. Other files are read without only where
+    the file system has none.
+    """
+    import h5py  # here, because few commands need it
+
+    _checked_status(path)
+    try:
+        return h5py.File(path, "r", locking=False if whole else None)
+    except OSError as error:
+        if error.errno not in ([None] if whole else _NO_LOCKS):
+            raise
+    # Not damaged, if locks show that another program is writing to it.
+    return h5py.File(path, "r", locking=None if whole else False)
+
+
+@contextlib.contextmanager
+def hdf5_errors(path: Path, damaged: Callable[[str], InputError]) -> Iterator[None]:
+    """Raise errors of the system as such, and any other as that of a `damaged` file, by reason."""
+    try:
+        yield
+    except MemoryError:
+        raise
+    except Exception as error:  # the type that h5py raises depends on the damage
+        if isinstance(error, InputError) and str(path) in str(error):
+            raise
+        if isinstance(error, OSError) and error.errno is not None:
+            raise _unread(path, cause_of(error)) from None
+        raise damaged(" ".join(str(error).split())[:200] or type(error).__name__) from None
 
 
 def is_name(text: Any) -> bool:
@@ -173,6 +308,21 @@ def is_name(text: Any) -> bool:
         and text not in (".", "..")
         and "/" not in text
     )
+
+
+def file_name_of(label: str) -> str:
+    """Name of a file for any label: one path component, another for every label.
+
+    Example:
+
+        >>> file_name_of("night stand"), file_name_of("tv/stereo")
+        ('night stand', 'tv_stereo-b599a4')
+    """
+    name = "".join(c if c.isprintable() and c not in '/\\<>:"|?*' else "_" for c in label)
+    cut = name.strip(". ").encode("utf-8", "replace")[:_LONGEST_NAME]
+    name = cut.decode("utf-8", "ignore") or "_"
+    # Labels that differ only in what was replaced keep names that differ.
+    return name if name == label else f"{name}-{hashlib.sha256(label.encode()).hexdigest()[:6]}"
 
 
 def _sync(path: Path) -> None:

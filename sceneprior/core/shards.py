@@ -12,7 +12,7 @@ from zlib_ng import zlib_ng
 
 from sceneprior.core.classes import STUFF, label_set
 from sceneprior.core.errors import ShardError
-from sceneprior.core.files import is_name
+from sceneprior.core.files import hdf5_errors, is_name, list_files, open_hdf5, read_json
 from sceneprior.core.observations import RoomGroundTruth, RoomViews, stuff_size, thinned
 
 if TYPE_CHECKING:
@@ -60,10 +60,8 @@ class Shard(contextlib.AbstractContextManager["Shard"]):
         self.path = Path(path)
         if not self.path.is_file():
             raise ShardError(f"No shard at {path}; {PREPARE} writes shards.")
-        import h5py  # here, because loading a prior does not need it
-
-        try:
-            self._file = h5py.File(self.path, "r")
+        with hdf5_errors(self.path, lambda reason: _damaged(self.path, reason)):
+            self._file = open_hdf5(self.path, whole=True)
             form = _decoded(self._file.attrs.get("format"))
             version = self._file.attrs.get("version")
             if form != FORMAT or version not in READABLE:
@@ -79,10 +77,6 @@ class Shard(contextlib.AbstractContextManager["Shard"]):
                 _text(group.attrs, "room_id"): key
                 for key, group in self._file.get("rooms", {}).items()
             }
-        except ShardError:
-            raise
-        except Exception as error:  # the type that h5py raises depends on the damage
-            raise _damaged(self.path, error) from None
 
     def close(self) -> None:
         """Close the file."""
@@ -99,12 +93,8 @@ class Shard(contextlib.AbstractContextManager["Shard"]):
     @contextlib.contextmanager
     def _group(self, room_id: str) -> Iterator["h5py.Group"]:
         """Open a room's group; errors in the block are raised as damage of the shard."""
-        try:
+        with hdf5_errors(self.path, lambda reason: _damaged(self.path, reason, room_id)):
             yield self._file["rooms"][self._keys[room_id]]
-        except ShardError:
-            raise
-        except Exception as error:
-            raise _damaged(self.path, error, room_id) from None
 
     def read_room(self, room_id: str, images: bool = False) -> RoomViews:
         """Read the views of a room; `images` also reads the instance-id images."""
@@ -279,9 +269,8 @@ def _inflate(images: "h5py.Dataset", view: int) -> np.ndarray:
     )
 
 
-def _damaged(path: Path, error: Exception, room_id: str = "") -> ShardError:
+def _damaged(path: Path, reason: str, room_id: str = "") -> ShardError:
     where = f", room {room_id}" if room_id else ""
-    reason = " ".join(str(error).split())[:200] or type(error).__name__
     return ShardError(
         f"{path}{where} cannot be read ({reason}): the file is damaged. "
         f"Delete it and run the same {PREPARE} command again."
@@ -293,7 +282,7 @@ def list_shards(folder: Path, split: str) -> list[Path]:
     folder = Path(folder)
     if not folder.is_dir():
         raise ShardError(f"No folder of shards at {folder}; make one with {PREPARE}.")
-    paths = sorted((folder / split).glob("*.h5"))
+    paths = list_files(folder / split, "*.h5")
     if not paths:
         read_index(folder)  # a folder that is not one of shards has no index
         raise ShardError(
@@ -314,12 +303,9 @@ def iterate_rooms(folder: Path, split: str) -> Iterator[tuple[Shard, str]]:
 def read_index(folder: Path) -> dict[str, Any]:
     """Read a folder's `index.json`: label set, room type, counts and recipe."""
     path = Path(folder) / INDEX_NAME
-    try:
-        return json.loads(path.read_text())
-    except OSError:
+    if not path.is_file():
         raise ShardError(
             f"{folder} has no {INDEX_NAME}; it is not a finished folder of shards. "
             f"Run {PREPARE} to its end."
-        ) from None
-    except ValueError as error:
-        raise ShardError(f"{path} is not JSON ({error}); prepare the folder again.") from None
+        )
+    return read_json(path, hint=f"prepare {folder} again")
