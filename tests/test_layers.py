@@ -40,8 +40,8 @@ MAY_TOO = {
 }
 
 BUDGET = {
-    "data_prep": (12366, 58),
-    "sceneprior/core": (5584, 28),
+    "data_prep": (12335, 58),
+    "sceneprior/core": (5580, 28),
     "sceneprior/furniture": (572, 4),
     "sceneprior/render": (4487, 23),
     "sceneprior/training": (866, 5),

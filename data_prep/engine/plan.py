@@ -1,8 +1,6 @@
 """plan.json: the rooms of a job, their splits and shards, fixed before the first is drawn."""
 
-import csv
 import hashlib
-import io
 import json
 import re
 from collections import Counter
@@ -13,9 +11,10 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from data_prep.engine.source import SPLITS, Line, RoomTask, Source, Survey
+from data_prep.engine.source import Line, RoomTask, Source, Survey
 from sceneprior.core.errors import InputError
-from sceneprior.core.shards import INDEX_NAME
+from sceneprior.core.files import list_files, read_table
+from sceneprior.core.shards import INDEX_NAME, SPLITS
 
 PLAN_NAME = "plan.json"
 PLAN_VERSION = 3
@@ -66,7 +65,7 @@ def read_plan(out: Path, source: Source, settings: dict[str, Any], renderer: str
     """
     path = out / PLAN_NAME
     if not path.is_file():
-        if any(out.glob("*/*.h5")) or (out / INDEX_NAME).exists():
+        if list_files(out, "*.h5", deep=True) or (out / INDEX_NAME).exists():
             raise InputError(f"{out} holds shards without a {PLAN_NAME}; choose a new folder.")
         return None
     try:
@@ -128,10 +127,7 @@ def is_asked_for(only: str | None, room_id: str, house: str) -> bool:
 
 def read_splits(path: Path) -> dict[str, str]:
     """Read the split of each room id from a CSV of `room id,split`; other rows are skipped."""
-    try:
-        rows = list(csv.reader(io.StringIO(Path(path).read_text())))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"No split file can be read at {path} ({error}).") from None
+    rows = read_table(path, "name a split file")
     meaning = {"train": "train", "test": "test", "val": "val", "validation": "val"}
     found = {
         row[0].strip(): meaning[row[1].strip().lower()]

@@ -11,9 +11,9 @@ from typing import Any
 from rich.table import Column, Table
 from rich.text import Text
 
-from data_prep.engine.source import SPLITS, Line, PreparedRoom, RoomTask, Source
+from data_prep.engine.source import Line, PreparedRoom, RoomTask, Source
 from sceneprior.core.classes import label_set
-from sceneprior.core.shards import INDEX_NAME
+from sceneprior.core.shards import INDEX_NAME, SPLITS
 
 REPORT_NAME = "report.json"
 TABLE_NAME = "report.csv"

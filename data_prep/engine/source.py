@@ -21,9 +21,6 @@ from sceneprior.core.observations import RoomGroundTruth, RoomViews
 from sceneprior.core.scene import Mesh
 from sceneprior.render.offscreen import Renderer
 
-SPLITS = ("train", "val", "test")
-"""Rooms for training, for choosing settings and checkpoints, and for reporting results."""
-
 Run = Callable[..., Iterator[Any]]
 """`run(function, argument_lists, title)` yields results in order (`pool`)."""
 
@@ -36,7 +33,7 @@ class RoomTask:
     house: str
     """File or folder the room is read from: a house, a scan."""
     split: str
-    """One of `SPLITS`."""
+    """One of `SPLITS` of shards."""
     views: int = 0
     """Number of views to draw; 0 if the data set has its own."""
     extra: dict[str, Any] = field(default_factory=dict)

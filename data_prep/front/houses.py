@@ -21,7 +21,7 @@ from data_prep.front.geometry import (
 from data_prep.front.recipe import Recipe
 from sceneprior.core.checked import shown
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import is_name, read_json
+from sceneprior.core.files import is_name, list_files, read_json
 from sceneprior.core.furniture import MODEL_FILE, tidy_category
 from sceneprior.core.scene import Mesh
 
@@ -60,7 +60,7 @@ def house_files(folder: Path) -> list[Path]:
     if (folder / "model_info.json").exists():
         raise InputError(f"{folder} holds furniture models, not houses; give it as --future.")
     inside = folder / "3D-FRONT"
-    files = [] if inside.is_dir() else sorted(folder.glob("*.json"))
+    files = [] if inside.is_dir() else list_files(folder, "*.json")
     if not files:
         hint = f"; did you mean {inside}?" if inside.is_dir() else "."
         raise InputError(f"{folder} holds no house JSONs (<uid>.json){hint}")

@@ -13,7 +13,7 @@ from data_prep.front.furnished import Room
 from sceneprior.core.checked import shown
 from sceneprior.core.classes import LABEL_SETS, label_set, label_set_name
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import is_name
+from sceneprior.core.files import is_name, read_text
 from sceneprior.core.furniture import category_table, class_of_category, tidy_category
 from sceneprior.core.settings import Section, apply_override, check_settings, read_yaml
 
@@ -154,13 +154,8 @@ def load_recipe(text: str, changes: tuple[str, ...] = ()) -> Recipe:
         apply_override(data, change, "--rule")
     for key in ("invalid_rooms", "invalid_models"):
         if isinstance(file := data.get(key), str):
-            try:
-                lines = {line.strip() for line in Path(file).read_text().splitlines()}
-                data[key] = sorted(lines - {""})
-            except (OSError, UnicodeDecodeError) as error:
-                raise InputError(
-                    f"{key} names a file of ids that cannot be read ({error})."
-                ) from None
+            lines = read_text(Path(file), hint=f"{key} names a file of ids").splitlines()
+            data[key] = sorted({line.strip() for line in lines} - {""})
     recipe = check_settings(Recipe, data, path.name)
     if not is_name(recipe.name):
         raise InputError(
@@ -182,7 +177,7 @@ def recipe_text(name: str) -> str:
             f"{name} is a file, not a recipe of the package, which `sceneprior recipe` prints; use "
             f"yours as it is: prep-front --recipe {name}."
         )
-    text, recipe = find_recipe(name).read_text(encoding="utf-8"), load_recipe(name)
+    text, recipe = read_text(find_recipe(name)), load_recipe(name)
     classes = {category: recipe.class_of(category) for category in category_table()}
     table = [f"  {category}: {label}\n" for category, label in classes.items() if label != "void"]
     head = (

@@ -16,7 +16,6 @@ from data_prep.engine.plan import (
     select,
 )
 from data_prep.engine.source import (
-    SPLITS,
     Line,
     PreparedRoom,
     RoomTask,
@@ -29,8 +28,9 @@ from data_prep.front.houses import House, house_files, parse_house, read_house
 from data_prep.front.recipe import Recipe, broken_rule, outside_floor, unknown_categories
 from data_prep.front.views import prepare_room, view_counts
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import file_stamp
+from sceneprior.core.files import file_stamp, read_text
 from sceneprior.core.furniture import model_categories, model_info_path
+from sceneprior.core.shards import SPLITS
 from sceneprior.render.offscreen import Renderer
 
 _HOUSES_PER_TASK = 8
@@ -71,7 +71,7 @@ class FrontSource:
         return {
             "recipe": recipe,
             "seed": self.seed,
-            "splits": None if self.splits is None else digest(Path(self.splits).read_text()),
+            "splits": None if self.splits is None else digest(read_text(self.splits)),
             "houses": digest_of_files(self._houses(only)),
             "models": digest_of_files([info]),
         }

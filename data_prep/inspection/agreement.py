@@ -12,6 +12,7 @@ from scipy.spatial import ConvexHull, QhullError
 from data_prep.readers.upright import own_sides
 from sceneprior.core.boxes import BOX_EDGES, box_corners
 from sceneprior.core.cameras import to_camera, to_pixels
+from sceneprior.core.errors import InputError
 from sceneprior.core.ground_truth import load_model, model_path
 from sceneprior.core.observations import RoomGroundTruth, RoomViews
 

@@ -8,14 +8,13 @@ import numpy as np
 import shapely
 from PIL import Image, ImageDraw, ImageFont
 
-from data_prep.engine.source import SPLITS
 from data_prep.inspection.agreement import Hull, project_edges
 from sceneprior.core.boxes import BOX_EDGES, box_corners
 from sceneprior.core.cameras import camera_centers
 from sceneprior.core.classes import class_colors, label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.observations import RoomGroundTruth, RoomViews
-from sceneprior.core.shards import Shard, list_shards
+from sceneprior.core.shards import Shard, list_shards, splits_of
 from sceneprior.core.wall_lines import find_walls, seen_floor
 from sceneprior.render.appearance import contact_sheet, paint_ids
 
@@ -75,9 +74,8 @@ def legend(wires: bool, floors: bool) -> str:
 
 def choose_views(folder: Path, room_id: str | None, pictures: int) -> list[tuple[Path, str, int]]:
     """Shard, room and number of views spread evenly over a folder, or over one room."""
-    splits = [split for split in SPLITS if any((Path(folder) / split).glob("*.h5"))]
     rooms = []
-    for path in [path for split in splits for path in list_shards(folder, split)]:
+    for path in (path for split in splits_of(folder) for path in list_shards(folder, split)):
         with Shard(path) as shard:
             rooms += [(path, name) for name in shard.room_ids]
     if not rooms:

@@ -8,14 +8,13 @@ from pathlib import Path
 from rich.table import Column, Table
 
 from data_prep.engine.report import make_table
-from data_prep.engine.source import SPLITS
 from data_prep.inspection.agreement import KINDS
 from data_prep.inspection.causes import CHANCE, GIVEN
 from data_prep.inspection.diagnosis import what_was_checked
 from data_prep.inspection.pictures import choose_views
 from data_prep.inspection.verify import FolderCheck, RoomCheck, agreement_of, evidence_of
 from sceneprior.core.classes import label_set
-from sceneprior.core.shards import Shard, iterate_rooms, read_index
+from sceneprior.core.shards import Shard, iterate_rooms, read_index, splits_of
 
 _WORST_SHOWN = 5
 
@@ -25,9 +24,7 @@ def count_tables(folder: Path) -> list[Table]:
     names = label_set(read_index(folder)["label_set"])
     totals, classes = [], {}
     turned: list[float] = []
-    for split in SPLITS:
-        if not any((folder / split).glob("*.h5")):
-            continue  # the folder was made with --only
+    for split in splits_of(folder):  # made with --only, a folder lacks some
         rooms, known = [], 0
         for shard, room_id in iterate_rooms(folder, split):
             rooms.append(room := shard.read_room(room_id))

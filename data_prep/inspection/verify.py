@@ -9,7 +9,7 @@ import numpy as np
 
 from data_prep.engine.plan import in_words
 from data_prep.engine.report import REPORT_NAME
-from data_prep.engine.source import SPLITS, Line, pool
+from data_prep.engine.source import Line, pool
 from data_prep.inspection.agreement import (
     Agreement,
     Limits,
@@ -27,7 +27,7 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
 from sceneprior.core.observations import RoomGroundTruth, RoomViews, observe
 from sceneprior.core.shard_writing import room_checksum
-from sceneprior.core.shards import Shard, list_shards, read_index
+from sceneprior.core.shards import Shard, list_shards, read_index, splits_of
 
 _TRIED_ROOMS = 3
 """Number of rooms in which objects are found without ids, or corrections of ground truth are
@@ -97,9 +97,7 @@ def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> Folder
     usual, conventions, failures = read_conventions(folder, source)
     problems = [f"{folder}: {failures}."] if failures and room_id is None else []
     rooms: dict[str, list[RoomCheck]] = {}
-    for split in SPLITS:
-        if not any((folder / split).glob("*.h5")):
-            continue
+    for split in splits_of(folder):
         paths = list_shards(folder, split)
         with pool(workers) as run:
             arguments = [(folder, path, name, room_id, usual, conventions) for path in paths]

@@ -79,13 +79,9 @@ def read_hdf5(path: Path, names: Sequence[str], hint: str) -> list[np.ndarray]:
         return [np.asarray(file[name][()]) for name in names]
 
 
-def unreadable(path: Path, error: Exception, why: str = "") -> InputError:
-    """Error of a scan's file that is missing or cannot be read."""
-    reason = getattr(error, "strerror", None) or error
-    return InputError(
-        f"{path} cannot be read ({reason}){'; ' if why else ''}{why}. "
-        f"Download it into the scan's folder, or leave {path.parent.name} out of the list of scans."
-    )
+def download(path: Path) -> str:
+    """What to do about a scan's file that is missing or cannot be read."""
+    return f"download it into the scan's folder, or leave {path.parent.name} out of the scans"
 
 
 @dataclass(frozen=True)

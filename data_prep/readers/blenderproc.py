@@ -30,6 +30,7 @@ from data_prep.readers.reader import FoundRoom, Reader, by_number
 from data_prep.readers.rooms import FramedRoom, numbered
 from sceneprior.core.checked import plain, shown
 from sceneprior.core.errors import InputError
+from sceneprior.core.files import list_files, list_folders
 from sceneprior.core.furniture import INFO_FILES, model_categories, tidy_category
 
 LABELS = "blender_label_mapping.csv"
@@ -82,13 +83,13 @@ class BlenderProc(Reader):
         }
 
     def scenes(self) -> list[str]:
-        return sorted(path.name for path in self.folder.iterdir() if any(path.glob("*.hdf5")))
+        return [path.name for path in list_folders(self.folder) if list_files(path, "*.hdf5")]
 
     def rooms(self, scene: str) -> dict[str, FoundRoom]:
         """Rooms of the recipe's types; a frame belongs to the room with most furniture pixels."""
         frames: dict[str, list[str]] = {}
         size = (0, 0)
-        for path in by_number([*(self.folder / scene).glob("*.hdf5")]):
+        for path in by_number(list_files(self.folder / scene, "*.hdf5")):
             image, parts = _read_frame(path)
             if size not in ((0, 0), image.shape):
                 raise InputError(

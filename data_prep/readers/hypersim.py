@@ -28,6 +28,7 @@ from data_prep.readers.reader import FoundRoom, Reader
 from data_prep.readers.rooms import FramedRoom, corners_of, numbered
 from sceneprior.core.checked import plain
 from sceneprior.core.errors import InputError
+from sceneprior.core.files import list_folders
 
 CAMERAS = "metadata_camera_parameters.csv"
 _BOXES = "metadata_semantic_instance_bounding_box_object_aligned_2d_{}.hdf5"
@@ -45,11 +46,11 @@ class Hypersim(Reader):
         return super().options()
 
     def scenes(self) -> list[str]:
-        return sorted(
+        return [
             path.name
-            for path in self.folder.iterdir()
+            for path in list_folders(self.folder)
             if re.fullmatch(r"ai_\d{3}_\d{3}", path.name) and (path / "_detail").is_dir()
-        )
+        ]
 
     def rooms(self, scene: str) -> dict[str, FoundRoom]:
         """The scene as one room."""
@@ -132,7 +133,7 @@ def _trajectories(scene: Path, unit: float) -> tuple[list[tuple[Path, Path]], np
     """Paths of each frame's id image and class image, and camera-to-world matrices in metres."""
     images: list[tuple[Path, Path]] = []
     poses: list[np.ndarray] = []
-    for folder in sorted((scene / "_detail").glob("cam_*")):
+    for folder in list_folders(scene / "_detail", "cam_*"):
         positions, turns = (
             read_hdf5(folder / f"camera_keyframe_{name}.hdf5", ("dataset",), _HINT)[0]
             for name in ("positions", "orientations")

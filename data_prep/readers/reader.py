@@ -15,7 +15,6 @@ from data_prep.engine.plan import (
     select,
 )
 from data_prep.engine.source import (
-    SPLITS,
     Line,
     PreparedRoom,
     RoomTask,
@@ -26,6 +25,7 @@ from data_prep.engine.source import (
 from data_prep.readers.annotations import LABEL_SET
 from data_prep.readers.rooms import FramedRoom, prepare_room
 from sceneprior.core.errors import InputError
+from sceneprior.core.shards import SPLITS
 from sceneprior.render.offscreen import Renderer
 
 

@@ -16,11 +16,11 @@ import numpy as np
 from PIL import Image
 from pydantic import BaseModel, Field
 
-from data_prep.readers.annotations import unreadable
+from data_prep.readers.annotations import download
 from sceneprior.core.cameras import to_camera
 from sceneprior.core.checked import checked, plain, shown
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import read_json
+from sceneprior.core.files import read_bytes, read_json
 from sceneprior.core.id_tables import png_kind
 from sceneprior.core.scene import Mesh
 
@@ -321,12 +321,10 @@ def read_mesh(path: Path) -> Mesh:
     """Read a PLY: vertices float64, metres."""
     from trimesh.exchange.ply import load_ply
 
-    if not path.is_file():
-        raise unreadable(path, FileNotFoundError("no such file"))
+    content = io.BytesIO(read_bytes(path, hint=download(path)))
     try:
         # Load raw arrays, not a Trimesh, which may merge or drop vertices: segments index them.
-        with path.open("rb") as file:
-            loaded = load_ply(file, fix_texture=False, skip_materials=True)
+        loaded = load_ply(content, fix_texture=False, skip_materials=True)
         vertices = np.array(loaded["vertices"], dtype=np.float64).reshape(-1, 3)
         faces = np.array(loaded.get("faces", ()), dtype=np.int64).reshape(-1, 3)
     except Exception as error:  # trimesh raises many types for damaged files
@@ -343,7 +341,7 @@ def read_mesh(path: Path) -> Mesh:
 
 def _read_json(model: type[_M], path: Path, why: str) -> _M:
     if not path.is_file():
-        raise unreadable(path, FileNotFoundError("no such file"), why)
+        raise InputError(f"{path} is missing; {why}; {download(path)}.")
     try:
         return checked(model, read_json(path), str(path))
     except InputError as error:

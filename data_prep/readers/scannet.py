@@ -16,7 +16,7 @@ import numpy as np
 
 from data_prep.engine.plan import digest, seeded_split
 from data_prep.engine.source import Line, RoomTask
-from data_prep.readers.annotations import LABEL_SET, Labels, read_labels, unreadable
+from data_prep.readers.annotations import LABEL_SET, Labels, download, read_labels
 from data_prep.readers.frames import (
     Y_UP,
     choose_frames,
@@ -36,6 +36,7 @@ from data_prep.readers.scan_files import (
 from sceneprior.core.checked import plain, shown
 from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.errors import InputError
+from sceneprior.core.files import list_folders, read_text
 from sceneprior.core.observations import thinned_stuff
 
 MASK_FILES = {"filt": "_2d-instance-filt.zip", "raw": "_2d-instance.zip"}
@@ -92,7 +93,7 @@ class ScanNet(Reader):
         return {
             "scans": digest("\n".join(scenes)),
             **{
-                name: None if path is None else digest(path.read_text(encoding="utf-8"))
+                name: None if path is None else digest(read_text(path))
                 for name, path in texts.items()
             },
         }
@@ -250,10 +251,7 @@ def read_alignment(path: Path) -> np.ndarray | None:
     It is among the `key = value` lines of `<scan>.txt`; None if the file has none, as for scans of
     version 1 and test scans.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise unreadable(path, error) from None
+    lines = read_text(path, hint=download(path)).splitlines()
     values = [line.partition("=")[2].split() for line in lines if _ALIGNMENT.match(line)]
     if not values:
         return None
@@ -280,7 +278,7 @@ def find_scans(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         raise InputError(f"No folder at {folder}; --scans names ScanNet's folder of scans.")
-    found = [path for path in sorted(folder.iterdir()) if path.is_dir() and _is_scan(path)]
+    found = list(filter(_is_scan, list_folders(folder)))
     if not found:
         inside = folder / "scans"
         hint = (
@@ -316,11 +314,8 @@ def split_scans(
     for path, split in ((train, "train"), (val, "test")):
         if path is None:
             continue
-        try:
-            lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
-        except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"The list of scans {path} cannot be read ({error}).") from None
-        for number, line in enumerate(lines, 1):
+        lines = read_text(path, hint="give a list of scans").splitlines()
+        for number, line in enumerate(map(str.strip, lines), 1):
             if re.search(r"[\s,;]", line):
                 raise InputError(
                     f"{path}, line {number}: '{line[:60]}' is not a scan id; expected one "

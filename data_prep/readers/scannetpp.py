@@ -35,7 +35,7 @@ from data_prep.readers.scan_files import AnnotatedMesh, read_annotated_mesh
 from sceneprior.core.checked import checked
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import read_json
+from sceneprior.core.files import list_folders, read_json
 from sceneprior.render.offscreen.zbuffer import rasterize
 
 _IPHONE = "iphone/pose_intrinsic_imu.json"
@@ -67,7 +67,7 @@ class ScanNetPP(Reader):
         return {**super().options(), "labels": labels}
 
     def scenes(self) -> list[str]:
-        return sorted(path.parents[1].name for path in self.folder.glob(f"*/{_MESH}"))
+        return [path.name for path in list_folders(self.folder) if (path / _MESH).is_file()]
 
     def rooms(self, scene: str) -> dict[str, FoundRoom]:
         """The scene as one room."""

@@ -29,7 +29,7 @@ from data_prep.readers.rooms import FramedRoom, corners_of, numbered
 from sceneprior.core.cameras import odd_field_of_view
 from sceneprior.core.checked import checked, shown
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import read_json
+from sceneprior.core.files import list_folders, read_json, read_text
 from sceneprior.core.id_tables import mask_size, read_mask
 
 _NONE = 65_535
@@ -78,11 +78,11 @@ class Structured3D(Reader):
     name: ClassVar = "structured3d"
 
     def scenes(self) -> list[str]:
-        return sorted(
+        return [
             path.name
-            for path in self.folder.iterdir()
+            for path in list_folders(self.folder)
             if re.fullmatch(r"scene_\d{5}", path.name) and (path / "2D_rendering").is_dir()
-        )
+        ]
 
     def official_split(self, scene: str) -> str | None:
         """The authors' split by the scene's number."""
@@ -92,7 +92,7 @@ class Structured3D(Reader):
     def rooms(self, scene: str) -> dict[str, FoundRoom]:
         """Rooms with perspective views of the furnished room."""
         found = {}
-        for path in sorted((self.folder / scene / "2D_rendering").iterdir()):
+        for path in list_folders(self.folder / scene / "2D_rendering"):
             if views := _views(path):
                 room_id = f"{scene}_{path.name}"
                 found[room_id] = FoundRoom(mask_size(views[0] / "instance.png"))
@@ -142,15 +142,15 @@ class Structured3D(Reader):
 
 def _views(room: Path) -> list[Path]:
     """Folders of a room's perspective views, by number."""
-    images = (room / "perspective" / "full").glob("*/instance.png")
-    return by_number([path.parent for path in images])
+    folders = list_folders(room / "perspective" / "full")
+    return by_number([path for path in folders if (path / "instance.png").is_file()])
 
 
 def _read_camera(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Camera to world, (4, 4), OpenCV axes, z up, metres; and the half angles along x and y."""
     try:
-        values = np.array([float(word) for word in path.read_text(encoding="utf-8").split()])
-    except (OSError, ValueError):
+        values = np.array([float(word) for word in read_text(path).split()])
+    except ValueError:
         values = np.zeros(0)
     if len(values) not in (11, 12) or not np.isfinite(values).all():
         raise InputError(

@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 from rich.console import Console
 from rich.progress import Progress
 
-from sceneprior.core.files import PARTS, write_whole
+from sceneprior.core.files import PARTS, list_files, write_whole
 from sceneprior.core.scene import Scene
 from sceneprior.core.scene_json import FORMAT
 from sceneprior.core.shell import ShellName
@@ -40,7 +40,7 @@ def clear_scenes(folder: Path) -> None:
     Scene JSONs with their GLBs and PNGs, latents, the page, and the partial files of interrupted
     writers are deleted; all other files stay.
     """
-    for path in Path(folder).glob("*.json"):
+    for path in list_files(folder, "*.json"):
         if format_of(path) == FORMAT:
             for ending in (".glb", ".png", ".json"):
                 path.with_suffix(ending).unlink(missing_ok=True)

@@ -1,6 +1,5 @@
 """Files: atomic writes, folder locks, lists of inputs, reading them, and their names."""
 
-import codecs
 import contextlib
 import csv
 import errno
@@ -236,11 +235,9 @@ def _unread(path: Path, reason: str, hint: str = "") -> InputError:
 
 
 def read_text(path: Path, most: int = _MOST_TEXT, hint: str = "") -> str:
-    """Read a text as UTF-8, or as UTF-16 by its byte order mark; lines end with a line feed."""
-    content = read_bytes(path, most, hint)
-    wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    """Read a text in UTF-8, without a byte order mark; lines end with a line feed."""
     try:
-        text = content.decode("utf-16" if wide else "utf-8-sig")
+        text = read_bytes(path, most, hint).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise _unread(path, str(error), hint or "save it as UTF-8") from None
     return text.replace("\r\n", "\n").replace("\r", "\n")

@@ -11,7 +11,7 @@ import numpy as np
 from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.errors import InputError, ShardError
 from sceneprior.core.scene import Mesh, Scene, SceneObject, mesh_of_file
-from sceneprior.core.shards import MODELS_FOLDER, Shard, iterate_rooms
+from sceneprior.core.shards import MODELS_FOLDER, Shard, iterate_rooms, splits_of
 
 
 def reference_scenes(
@@ -34,7 +34,7 @@ def reference_scenes(
 
 def known_in_3d(shards: Path, split: str) -> bool:
     """True if a split has rooms, and all have ground truth; rooms of posed pictures have none."""
-    return any((Path(shards) / split).glob("*.h5")) and all(
+    return split in splits_of(shards) and all(
         shard.has_ground_truth(room_id) for shard, room_id in iterate_rooms(shards, split)
     )
 

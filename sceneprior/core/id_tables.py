@@ -1,7 +1,5 @@
 """PNGs of instance ids, tables of their classes, and their renumbering for `observe`."""
 
-import csv
-import io
 import json
 import re
 import zlib
@@ -16,6 +14,7 @@ from PIL import Image
 from sceneprior.core.checked import plain
 from sceneprior.core.classes import STUFF, VOID, label_set
 from sceneprior.core.errors import InputError
+from sceneprior.core.files import read_table, read_text
 
 SHELL = frozenset(
     ["background", "wall", "floor", "ceiling", "door", "window", "blinds", "mirror", "picture"]
@@ -39,18 +38,16 @@ def read_class_table(path: Path) -> dict[int, str]:
     `name`; a row with id 0 is skipped. A CSV has rows `id,class`, with or without a header.
     """
     try:
-        content = path.read_text(encoding="utf-8-sig")
         if path.suffix.lower() == ".json":
-            pairs = _json_rows(path, content)
+            pairs = _json_rows(path, read_text(path))
         else:
-            lines = csv.reader(io.StringIO(content))
-            rows = [row for row in lines if any(cell.strip() for cell in row)]
+            rows = [row for row in read_table(path) if any(cell.strip() for cell in row)]
             if rows and not rows[0][0].strip().isdigit():
                 rows = rows[1:]
             if short := [row for row in rows if len(row) < 2]:
                 raise ValueError(f"a row '{plain(short[0][0])}' has no class")
             pairs = [(row[0].strip(), row[1]) for row in rows]
-    except (OSError, ValueError, RecursionError, csv.Error) as error:
+    except (ValueError, RecursionError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path} cannot be read ({str(error)[:120]}).") from None

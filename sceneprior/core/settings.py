@@ -11,7 +11,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from sceneprior.core.errors import ConfigError
-from sceneprior.core.files import write_whole
+from sceneprior.core.files import read_text, write_whole
 
 MOST_BYTES = 2**20
 """Maximum size of a settings file."""
@@ -84,12 +84,9 @@ def read_settings(name: str, overrides: tuple[str, ...] = ()) -> tuple[Path, dic
 
 def read_yaml(path: Path) -> dict[str, Any]:
     """Read a YAML file of settings."""
+    text = read_text(path, MOST_BYTES)
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise yaml.YAMLError(f"it has more than {MOST_BYTES:,} bytes")
-        data = yaml.load(path.read_text(encoding="utf-8"), _Loader)
-    except OSError as error:
-        raise ConfigError(f"{path} cannot be read ({error.strerror}).") from None
+        data = yaml.load(text, _Loader)
     # Python itself raises a ValueError for invalid dates and for numbers of thousands of digits.
     except (ValueError, RecursionError, yaml.YAMLError) as error:
         raise ConfigError(f"{path} is not a YAML file: {shortened(error)}") from None

@@ -26,6 +26,8 @@ INDEX_NAME = "index.json"
 PREPARE = "`sceneprior prep-front`, `prep-scannet`, `prep-posed` or `prep-dataset`"
 """Commands that write shards, for messages."""
 MODELS_FOLDER = "models"
+SPLITS = ("train", "val", "test")
+"""Rooms for training, for choosing settings and checkpoints, and for reporting results."""
 _Side = int | str
 VIEW_ARRAYS: dict[str, tuple[str, tuple[_Side, ...]]] = {
     "object_class": ("int16", ("n",)),
@@ -275,6 +277,11 @@ def _damaged(path: Path, reason: str, room_id: str = "") -> ShardError:
         f"{path}{where} cannot be read ({reason}): the file is damaged. "
         f"Delete it and run the same {PREPARE} command again."
     )
+
+
+def splits_of(folder: Path) -> list[str]:
+    """The splits that have shards; a folder made with `--only` has one."""
+    return [split for split in SPLITS if list_files(Path(folder) / split, "*.h5")]
 
 
 def list_shards(folder: Path, split: str) -> list[Path]:

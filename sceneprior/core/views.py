@@ -15,7 +15,7 @@ from torch.nn.utils.rnn import pad_sequence
 from sceneprior.core.cameras import camera_centers
 from sceneprior.core.errors import InputError
 from sceneprior.core.observations import RoomViews, thinned
-from sceneprior.core.shards import iterate_rooms
+from sceneprior.core.shards import iterate_rooms, splits_of
 
 _B = TypeVar("_B", bound="Batch")
 _Rooms = TypeVar("_Rooms", bound="RoomBoxes")
@@ -211,11 +211,9 @@ def image_of_room(room: RoomViews, view: int, label_set: str) -> ObservedImage:
 
 
 def image_from_shards(folder: Path, room_id: str, view: int) -> ObservedImage:
-    """Read one view of a room of the test or train split."""
+    """Read one view of a room, of any split."""
     found: list[str] = []
-    for split in ("test", "train"):
-        if not any((Path(folder) / split).glob("*.h5")):
-            continue
+    for split in reversed(splits_of(folder)):
         for shard, name in iterate_rooms(folder, split):
             if name == room_id:
                 return image_of_room(shard.read_room(name, images=True), view, shard.label_set)

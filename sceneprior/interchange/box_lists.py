@@ -12,7 +12,7 @@ from jaxtyping import Float
 from sceneprior.core.boxes import yaw_rotation
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import read_json, write_whole
+from sceneprior.core.files import list_files, read_json, write_whole
 from sceneprior.core.scene import Mesh, Scene, SceneObject, Turned, bound_m
 from sceneprior.core.scene_json import MOST_OBJECTS, check_box
 from sceneprior.core.shell import floor_polygon
@@ -52,7 +52,7 @@ def read_box_lists(
     boxes = Path(boxes)
     files = {boxes: boxes.stem}
     if not boxes.is_file():
-        found = [path for path in sorted(boxes.rglob("*")) if path.suffix in (".npz", ".json")]
+        found = [p for p in list_files(boxes, deep=True) if p.suffix in (".npz", ".json")]
         parts = (path.relative_to(boxes).with_suffix("").parts for path in found)
         files = {
             path: "_".join(some).removesuffix("_boxes")

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from sceneprior.core.errors import InputError, InputWarning
-from sceneprior.core.files import is_name, read_json, write_json, write_whole
+from sceneprior.core.files import is_name, list_files, read_json, write_json, write_whole
 from sceneprior.core.scene import Mesh, Scene, Textured
 from sceneprior.core.scene_json import FORMAT, read_scene, scene_to_json
 from sceneprior.core.shell import ShellName, is_shell, shell_meshes
@@ -242,7 +242,7 @@ def load_scene_folder(folder: Path, with_materials: bool = False) -> list[Scene]
         raise InputError(f"No folder of scenes at {folder}; `sceneprior synthesize` writes one.")
     # Zero-padded numbers sort like numbers.
     paths = sorted(
-        folder.glob("*.json"),
+        list_files(folder, "*.json"),
         key=lambda path: [
             part.zfill(20) if part.isdigit() else part for part in re.split(r"(\d+)", path.stem)
         ],
@@ -253,7 +253,7 @@ def load_scene_folder(folder: Path, with_materials: bool = False) -> list[Scene]
         load_scene(path, with_materials) for path, form in formats.items() if form in (FORMAT, None)
     ]
     if not scenes:
-        _refuse_box_lists(folder, [*folder.rglob("*.npz"), *paths])
+        _refuse_box_lists(folder, [*list_files(folder, "*.npz", deep=True), *paths])
         raise InputError(
             f"{folder} holds no scene JSON; `sceneprior synthesize` writes them, and "
             "docs/conventions.md describes the format."

@@ -25,7 +25,7 @@ from data_prep.readers.posed.cameras import Camera, Number
 from data_prep.readers.posed.recording import PosedFrame
 from sceneprior.core.checked import checked, plain, shown
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import read_json
+from sceneprior.core.files import list_files, read_bytes, read_json, read_text
 
 FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 """Folders in which COLMAP or nerfstudio put a model."""
@@ -116,7 +116,7 @@ def _camera(path: Path, model: str, size: tuple[int, int], values: list[float]) 
 
 def _read_text(cameras: Path, images: Path) -> _Model:
     lines, image_lines = (
-        [line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+        [line for line in read_text(path).splitlines() if not line.startswith("#")]
         for path in (cameras, images)
     )
     known = {}
@@ -155,7 +155,7 @@ def _take(file: BinaryIO, form: str) -> tuple[Any, ...]:
 def polycam_files(folder: Path) -> list[Path]:
     """The JSONs of a raw export's keyframes, preferably the optimized ones; empty without any."""
     for name in KEYFRAMES:
-        if paths := sorted((folder / name).glob("*.json")):
+        if paths := list_files(folder / name, "*.json"):
             return paths
     return []
 
@@ -188,7 +188,7 @@ def record3d_files(folder: Path) -> list[Path]:
     """The JSON of a recording; empty if there is none. A file without poses is ignored."""
     for name in METADATA:
         path = folder / name
-        if path.is_file() and b'"poses"' in path.read_bytes():
+        if path.is_file() and b'"poses"' in read_bytes(path):
             return [path]
     return []
 

@@ -26,7 +26,7 @@ from sceneprior.core.checked import checked, shown
 from sceneprior.core.classes import STUFF, label_set
 from sceneprior.core.coco import CROWD, Category, CocoId, Side, read_coco_json
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import read_json
+from sceneprior.core.files import list_files, read_json
 from sceneprior.core.id_tables import LARGEST_ID, mask_size, read_rgb, stuff_of, tidy
 
 FILES = ("*coco*.json", "instances*.json", "annotations*.json", "annotations/*.json")
@@ -146,7 +146,7 @@ class CocoMasks(MaskFormat):
 
     @classmethod
     def find(cls, folder: Path) -> list[Path]:
-        return sorted({path for pattern in FILES for path in folder.glob(pattern)})
+        return sorted({path for pattern in FILES for path in list_files(folder, pattern)})
 
     @cached_property
     def _content(self) -> _Images | _Videos:
@@ -240,7 +240,9 @@ class PanopticPngs(FramePngs):
     @classmethod
     def find(cls, folder: Path) -> list[Path]:
         table = folder / PANOPTIC
-        return [table, *sorted((folder / INSTANCES).rglob("*.png"))] if table.is_file() else []
+        return (
+            [table, *list_files(folder / INSTANCES, "*.png", deep=True)] if table.is_file() else []
+        )
 
     def of_png(self, path: Path) -> FrameMask:
         return FrameMask(

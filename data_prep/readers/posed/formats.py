@@ -1,6 +1,5 @@
 """Parses `--from` and `--label-set`; guesses the tools that wrote a room's poses and masks."""
 
-import json
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from data_prep.readers.posed.transforms import POSES
 from sceneprior.core.checked import shown
 from sceneprior.core.classes import LABEL_SETS, label_set_name
 from sceneprior.core.errors import InputError
+from sceneprior.core.files import read_json, read_text
 
 _MASKS: tuple[type[MaskFormat], ...] = (
     IdPngs, PanopticPngs, ObjectFolders, GroundedSam2, GroundedSam2Images, CocoMasks,
@@ -86,15 +86,8 @@ def read_label_set(text: str) -> str:
             f"--label-set {text} is neither a file with one class per line, nor one of "
             f"{', '.join(LABEL_SETS)}, nor a list such as void,bed,chair."
         )
-    try:
-        content = path.read_text(encoding="utf-8")
-        names = (
-            json.loads(content)
-            if path.suffix.lower() == ".json"
-            else [line.strip() for line in content.splitlines()]
-        )
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path} holds no class names ({str(error)[:120]}).") from None
+    is_json = path.suffix.lower() == ".json"
+    names = read_json(path) if is_json else list(map(str.strip, read_text(path).splitlines()))
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise InputError(f"{path} holds no list of class names.")
     try:

@@ -36,6 +36,7 @@ from data_prep.readers.reader import FoundRoom, Reader
 from data_prep.readers.rooms import FramedRoom
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
+from sceneprior.core.files import list_folders
 
 TRACKS = ("given", "auto")
 
@@ -273,8 +274,8 @@ def find_rooms(folder: Path, poses: str | None = None) -> list[Path]:
         return [folder]
     found = [
         path
-        for path in sorted(folder.iterdir())
-        if path.is_dir() and (pose_files(path, poses)[1] or (path / INSTANCES).is_dir())
+        for path in list_folders(folder)
+        if (pose_files(path, poses)[1] or (path / INSTANCES).is_dir())
     ]
     if not found:
         tools = POSES.values() if poses is None else [POSES[poses]]

@@ -28,7 +28,7 @@ from data_prep.readers.posed.recording import INSTANCES, PosedFrame
 from sceneprior.core.checked import checked, plain
 from sceneprior.core.coco import paint
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import read_json
+from sceneprior.core.files import list_files, list_folders, read_json
 from sceneprior.core.id_tables import LARGEST_ID, mask_size, read_class_table, read_mask
 
 MASKS, LABELS, PREFIX = "mask_data", "json_data", "mask_"
@@ -47,13 +47,13 @@ class IdPngs(FramePngs):
     @classmethod
     def find(cls, folder: Path) -> list[Path]:
         inside = folder / INSTANCES
-        return sorted(inside.rglob("*.png")) + sorted(inside.rglob("*.json"))
+        return [*list_files(inside, "*.png", deep=True), *list_files(inside, "*.json", deep=True)]
 
     @property
     def tracked(self) -> bool:
         """False if the classes are beside each PNG and the room has no table."""
-        beside = (self.folder / INSTANCES).rglob("*.json")
-        return any((self.folder / name).is_file() for name in TABLES) or not any(beside)
+        beside = list_files(self.folder / INSTANCES, "*.json", deep=True)
+        return any((self.folder / name).is_file() for name in TABLES) or not beside
 
     def of_png(self, path: Path) -> FrameMask:
         return FrameMask(
@@ -92,7 +92,7 @@ class ObjectFolders(MaskFormat):
 
     @classmethod
     def find(cls, folder: Path) -> list[Path]:
-        return [path for place in _object_folders(folder) for path in sorted(place.glob("*.png"))]
+        return [path for place in _object_folders(folder) for path in list_files(place, "*.png")]
 
     @cached_property
     def _objects(self) -> dict[int, Path]:
@@ -116,7 +116,7 @@ class ObjectFolders(MaskFormat):
     def frames(self) -> dict[str, FrameMask]:
         paths: dict[str, dict[int, Path]] = {}
         for number, folder in sorted(self._objects.items()):
-            for path in folder.glob("*.png"):
+            for path in list_files(folder, "*.png"):
                 paths.setdefault(path.stem, {})[number] = path
         return {
             stem: FrameMask(
@@ -144,8 +144,8 @@ def _object_folders(room: Path) -> list[Path]:
     for place in PLACES:
         folders = [
             path
-            for path in sorted((room / place).glob("[0-9]*"))
-            if re.fullmatch("[0-9]{1,9}", path.name) and any(path.glob("*.png"))
+            for path in list_folders(room / place)
+            if re.fullmatch("[0-9]{1,9}", path.name) and list_files(path, "*.png")
         ]
         if folders:
             return folders
@@ -185,8 +185,8 @@ class GroundedSam2(MaskFormat):
 
     @classmethod
     def find(cls, folder: Path) -> list[Path]:
-        masks = sorted((folder / MASKS).glob(f"{PREFIX}*.npy"))
-        return [*masks, *sorted((folder / LABELS).glob(f"{PREFIX}*.json"))] if masks else []
+        masks = list_files(folder / MASKS, f"{PREFIX}*.npy")
+        return [*masks, *list_files(folder / LABELS, f"{PREFIX}*.json")] if masks else []
 
     @cached_property
     def frames(self) -> dict[str, FrameMask]:
@@ -196,7 +196,7 @@ class GroundedSam2(MaskFormat):
                 partial(_read_ids, path),
                 partial(_labels, self.folder / LABELS / f"{path.stem}.json"),
             )
-            for path in (self.folder / MASKS).glob(f"{PREFIX}*.npy")
+            for path in list_files(self.folder / MASKS, f"{PREFIX}*.npy")
         }
 
     def wanted(self, frame: PosedFrame) -> str:
@@ -204,7 +204,7 @@ class GroundedSam2(MaskFormat):
         return f"{self.folder / MASKS / f'{PREFIX}{frame.stem}.npy'}{instead(there)}"
 
     def classes(self) -> dict[int, str]:
-        paths = sorted((self.folder / LABELS).glob(f"{PREFIX}*.json"))
+        paths = list_files(self.folder / LABELS, f"{PREFIX}*.json")
         classes, self.notes = main_classes(map(_labels, paths))
         if not classes:
             raise InputError(
@@ -284,7 +284,7 @@ class GroundedSam2Images(MaskFormat):
 
     @classmethod
     def find(cls, folder: Path) -> list[Path]:
-        return [] if GroundedSam2.find(folder) else sorted((folder / LABELS).glob("*.json"))
+        return [] if GroundedSam2.find(folder) else list_files(folder / LABELS, "*.json")
 
     @cached_property
     def frames(self) -> dict[str, FrameMask]:

@@ -26,7 +26,7 @@ from data_prep.readers.posed.recording import (
 )
 from sceneprior.core.checked import checked, number_array, shown
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import read_json
+from sceneprior.core.files import list_files, read_json
 
 FILE_NAME = "transforms.json"
 
@@ -66,7 +66,7 @@ def pose_files(folder: Path, given: str | None = None) -> tuple[str, list[Path]]
     found = {
         name: [*files, *of_room] for name, tool in TOOLS.items() if (files := tool.find(folder))
     }
-    own = of_room or sorted(folder.glob("transforms_*.json"))
+    own = of_room or list_files(folder, "transforms_*.json")
     if own:
         data: Any = None
         with contextlib.suppress(InputError):  # reading it will raise the error

@@ -1,7 +1,6 @@
 """Write the report page of a run, or of a folder of the user's scenes."""
 
 import csv
-import json
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from sceneprior.apps.experiments.comparison import GIVEN, made_by_run
 from sceneprior.apps.experiments.evaluate import decoded_and_true
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.errors import InputError
+from sceneprior.core.files import read_json
 from sceneprior.core.ground_truth import known_in_3d
 from sceneprior.core.scene import Scene
 from sceneprior.evaluation.report import ROOMS_SHOWN, write_report
@@ -88,10 +88,10 @@ def read_scores(path: Path | None, folder: Path, shards: Path, evaluated: str) -
         if not path.exists() and not known_in_3d(shards, "test"):
             return {}
     try:
-        found = json.loads(path.read_text())
+        found = read_json(path)
         if not isinstance(found, dict) or found.get("format") != FORMAT:
             raise ValueError("another file")
-    except (OSError, ValueError) as error:
+    except ValueError as error:
         raise InputError(
             f"{path} holds no scores ({error}); write them with `sceneprior eval-fid {evaluated}`."
         ) from None

@@ -26,7 +26,7 @@ from jaxtyping import Float
 
 from sceneprior.core.classes import LABEL_SETS, label_set
 from sceneprior.core.errors import InputError, InputWarning
-from sceneprior.core.files import file_stamp, is_name, write_whole
+from sceneprior.core.files import file_stamp, is_name, list_files, list_folders, write_whole
 from sceneprior.core.furniture import (
     INFO_FILES,
     MODEL_FILE,
@@ -193,8 +193,8 @@ def _labels_of_shards(folder: Path, label_set_name: str) -> dict[str, str]:
 def _own_models(folder: Path, label_set_name: str) -> _ModelFiles:
     """Models in sub-folders by class; a folder with an unknown class name gives a warning."""
     labels = dict[str, str]()
-    for home in sorted(path for path in folder.iterdir() if path.is_dir()):
-        files = sorted(path for path in home.iterdir() if path.suffix.lower() in (".glb", ".obj"))
+    for home in list_folders(folder):
+        files = [path for path in list_files(home) if path.suffix.lower() in (".glb", ".obj")]
         label = class_of_folder(home.name, label_set_name)
         if files and label is None:
             warnings.warn(
