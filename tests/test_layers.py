@@ -41,15 +41,15 @@ MAY_TOO = {
 
 BUDGET = {
     "data_prep": (12335, 58),
-    "sceneprior/core": (5580, 28),
+    "sceneprior/core": (5582, 28),
     "sceneprior/furniture": (572, 4),
-    "sceneprior/render": (4487, 23),
+    "sceneprior/render": (4489, 23),
     "sceneprior/training": (866, 5),
     "sceneprior/paper": (2409, 12),
     "sceneprior/lifted": (7743, 38),
     "sceneprior/baselines": (2909, 14),
     "sceneprior/evaluation": (4136, 20),
-    "sceneprior/interchange": (903, 5),
+    "sceneprior/interchange": (905, 5),
     "sceneprior/apps": (6194, 34),
 }
 """Most lines and modules of a folder. They go down freely, and up only in a commit that says what

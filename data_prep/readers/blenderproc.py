@@ -30,7 +30,7 @@ from data_prep.readers.reader import FoundRoom, Reader, by_number
 from data_prep.readers.rooms import FramedRoom, numbered
 from sceneprior.core.checked import plain, shown
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import list_files, list_folders
+from sceneprior.core.files import check_file, list_files, list_folders
 from sceneprior.core.furniture import INFO_FILES, model_categories, tidy_category
 
 LABELS = "blender_label_mapping.csv"
@@ -179,14 +179,13 @@ def _read_frame(path: Path) -> tuple[np.ndarray, list[_Part]]:
 def _intrinsics(folder: Path) -> np.ndarray:
     """Intrinsics of all frames, (3, 3), with the centre of the first pixel at (0.5, 0.5)."""
     path = folder / "cam_K.npy"
+    hint = "it is the camera matrix that the authors' script writes beside the houses"
+    check_file(path, hint=hint)
     try:
         K = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
-        reason = getattr(error, "strerror", None) or plain(str(error), 120)
-        raise InputError(
-            f"{path} cannot be read ({reason}); it is the camera matrix that the "
-            "authors' script writes beside the houses."
-        ) from None
+        reason = plain(str(error), 120)
+        raise InputError(f"{path} cannot be read ({reason}); {hint}.") from None
     if K.shape != (3, 3) or not np.isfinite(K).all() or min(K[0, 0], K[1, 1]) <= 0:
         raise InputError(f"{path} holds no camera matrix of 3 x 3 numbers.")
     K = K.astype(np.float64)

@@ -5,6 +5,7 @@ import contextlib
 import io
 import re
 import struct
+import sys
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -20,7 +21,7 @@ from data_prep.readers.annotations import download
 from sceneprior.core.cameras import to_camera
 from sceneprior.core.checked import checked, plain, shown
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import read_bytes, read_json
+from sceneprior.core.files import cause_of, check_file, read_bytes, read_json
 from sceneprior.core.id_tables import png_kind
 from sceneprior.core.scene import Mesh
 
@@ -62,15 +63,13 @@ def read_sens(path: Path) -> SensRecording:
 
     Source: ScanNet's SensReader (sensorData.h), version 4.
     """
+    size = check_file(path, sys.maxsize, "a scan folder holds it as <scene>.sens").st_size
     try:
         # The file is unbuffered, because a buffer would read 100 KB around every header.
         with path.open("rb", buffering=0) as file:
-            return _read(_Part(path, file, path.stat().st_size))
+            return _read(_Part(path, file, size))
     except OSError as error:
-        raise InputError(
-            f"{path} cannot be opened ({error.strerror}); "
-            "a scan folder holds its recording as <scene>.sens."
-        ) from None
+        raise InputError(f"{path} cannot be read ({cause_of(error)}).") from None
 
 
 @dataclass
@@ -158,6 +157,7 @@ def _read(part: _Part) -> SensRecording:
 @contextlib.contextmanager
 def open_masks(path: Path) -> Iterator["MaskArchive"]:
     """Open a zip of masks."""
+    check_file(path, sys.maxsize, "download it again")
     try:
         archive = zipfile.ZipFile(path)
     except _DAMAGE as error:

@@ -10,6 +10,7 @@ import json
 import os
 import secrets
 import stat
+import sys
 from collections.abc import Callable, Iterator
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -163,10 +164,7 @@ def _remove_empty(folders: list[Path]) -> None:
 
 def file_stamp(path: Path) -> tuple[int, int]:
     """Modification time (ns) and size (bytes) of a file, to detect changes."""
-    try:
-        status = path.stat()
-    except OSError as error:
-        raise _unread(path, cause_of(error)) from None
+    status = check_file(path)
     return status.st_mtime_ns, status.st_size
 
 
@@ -206,28 +204,33 @@ def _entries(folder: Path, pattern: str, deep: bool = False) -> Iterator[tuple[P
             yield from _entries(path, pattern, deep)
 
 
-def read_bytes(path: Path, most: int = _MOST_BYTES, hint: str = "") -> bytes:
-    """Read a regular file of at most `most` bytes; `hint` says what to do if that fails.
+def check_file(path: Path, most: int = _MOST_BYTES, hint: str = "") -> os.stat_result:
+    """Check that a path leads to a regular file of at most `most` bytes, before it is opened.
+
+    Opening a pipe may wait for ever, and a device may have no end. `hint` says what to do.
 
     Raises:
-        InputError: it cannot be read, is a folder, pipe or device, or is larger.
+        InputError: it is missing, another kind of thing, or larger.
     """
-    path = Path(path)
     try:
-        size = _checked_status(path).st_size
-        if size > most:
-            raise _unread(path, f"it has {size} bytes, expected at most {most}", hint)
-        return path.read_bytes()
+        status = Path(path).stat()
     except OSError as error:
         raise _unread(path, cause_of(error), hint) from None
-
-
-def _checked_status(path: Path) -> os.stat_result:
-    """Status of a file; pipes would wait for their writer, and devices may have no end."""
-    status = path.stat()
-    if not stat.S_ISREG(status.st_mode) and not stat.S_ISDIR(status.st_mode):
-        raise _unread(path, "it is a pipe or a device", "name a file")
+    if not stat.S_ISREG(status.st_mode):
+        is_folder = stat.S_ISDIR(status.st_mode)
+        raise _unread(path, "it is a folder" if is_folder else "it is a pipe or a device", hint)
+    if status.st_size > most:
+        raise _unread(path, f"it has {status.st_size} bytes, expected at most {most}", hint)
     return status
+
+
+def read_bytes(path: Path, most: int = _MOST_BYTES, hint: str = "") -> bytes:
+    """Read a file that `check_file` finds in order."""
+    check_file(path, most, hint)
+    try:
+        return Path(path).read_bytes()
+    except OSError as error:
+        raise _unread(path, cause_of(error), hint) from None
 
 
 def _unread(path: Path, reason: str, hint: str = "") -> InputError:
@@ -271,7 +274,7 @@ def open_hdf5(path: Path, whole: bool = False) -> "h5py.File":
     """
     import h5py  # here, because few commands need it
 
-    _checked_status(path)
+    check_file(path, sys.maxsize)
     try:
         return h5py.File(path, "r", locking=False if whole else None)
     except OSError as error:

@@ -14,7 +14,7 @@ from PIL import Image
 from sceneprior.core.checked import plain
 from sceneprior.core.classes import STUFF, VOID, label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import read_table, read_text
+from sceneprior.core.files import check_file, read_table, read_text
 
 SHELL = frozenset(
     ["background", "wall", "floor", "ceiling", "door", "window", "blinds", "mirror", "picture"]
@@ -202,6 +202,7 @@ def _pixels(path: Path, rgb: bool) -> np.ndarray:
 
 
 def _open(path: Path, rgb: bool) -> Image.Image:
+    check_file(path)
     try:
         with path.open("rb") as file:
             kind = png_kind(file.read(_HEADER_BYTES))
@@ -219,7 +220,5 @@ def _open(path: Path, rgb: bool) -> Image.Image:
         return Image.open(path, formats=("PNG",))
     except InputError:
         raise
-    except FileNotFoundError:
-        raise InputError(f"{path} is missing.") from None
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(f"{path} is not a readable PNG ({str(error)[:120]}).") from None

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from sceneprior.core.boxes import yaw_rotation
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import list_files, read_json, write_whole
+from sceneprior.core.files import check_file, list_files, read_json, write_whole
 from sceneprior.core.scene import Mesh, Scene, SceneObject, Turned, bound_m
 from sceneprior.core.scene_json import MOST_OBJECTS, check_box
 from sceneprior.core.shell import floor_polygon
@@ -76,6 +76,7 @@ def read_box_lists(
 
 
 def _records(path: Path) -> list[dict[str, Any]]:
+    check_file(path)
     try:
         if path.suffix == ".npz":
             with np.load(path, allow_pickle=False) as file:

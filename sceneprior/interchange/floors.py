@@ -21,7 +21,7 @@ from scipy.sparse.csgraph import connected_components
 
 from sceneprior.core.checked import number_array, shown
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import read_json
+from sceneprior.core.files import check_file, read_json
 from sceneprior.core.scene import Opening
 from sceneprior.core.scene_json import FORMAT, check_floor, read_scene
 from sceneprior.core.shell import walls_of
@@ -139,6 +139,7 @@ def floor_outline(path: Path, room: dict[str, Any]) -> np.ndarray | None:
 
 
 def _atiss_floor(path: Path) -> np.ndarray:
+    check_file(path)
     try:
         with np.load(path, allow_pickle=False) as file:
             record = {key: file[key] for key in FLOOR if key in file}

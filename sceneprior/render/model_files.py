@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from sceneprior.core.files import check_file
 from sceneprior.core.scene import Mesh, Textured, join_meshes, mesh_of_file
 from sceneprior.render.appearance import linear_rgba
 
@@ -30,6 +31,7 @@ def load_parts(
     """
     import trimesh
 
+    check_file(path)
     # process=False keeps vertices and faces as written.
     loaded = trimesh.load_scene(
         Path(path), file_type=file_type, process=False, skip_materials=not with_materials

@@ -1,5 +1,8 @@
 """The shard format: what is written is read, whole or not at all, and damage is one sentence."""
 
+import errno
+import fcntl
+import os
 from dataclasses import fields, replace
 
 import h5py
@@ -8,7 +11,8 @@ import pytest
 from made_shards import make_room, make_truth, with_stuff
 from toy_rooms import write_shard
 
-from sceneprior.core.errors import ShardError
+from data_prep.readers.annotations import read_hdf5
+from sceneprior.core.errors import InputError, ShardError
 from sceneprior.core.observations import stuff_size, stuff_step, thinned, thinned_intrinsics
 from sceneprior.core.shard_writing import room_checksum
 from sceneprior.core.shards import Shard, iterate_rooms
@@ -129,3 +133,66 @@ def test_shards_of_before_have_no_checksum(tmp_path):
         for read in (shard.read_checksum, shard.has_ground_truth):
             with pytest.raises(ShardError, match="room nowhere cannot be read"):
                 read("nowhere")
+
+
+def read_as_shard(path):
+    with Shard(path) as shard:
+        return shard.room_ids
+
+
+def read_as_annotation(path):
+    return read_hdf5(path, ["rooms/h_1/boxes"], "render it again")
+
+
+READERS = {"shard": read_as_shard, "annotation": read_as_annotation}
+NOT_DAMAGE = (
+    errno.EAGAIN, errno.ENOLCK, errno.EACCES, errno.EMFILE, errno.ELOOP, errno.EIO, errno.ESTALE,
+)  # fmt: skip
+
+
+@pytest.fixture
+def written(tmp_path):
+    path = tmp_path / "train" / "a.h5"
+    write_shard(path, "front3d_bedroom", [(make_room("h_1"), make_truth())])
+    return path
+
+
+@pytest.mark.parametrize("reads", READERS.values(), ids=READERS)
+@pytest.mark.parametrize("number", NOT_DAMAGE)
+def test_a_file_that_cannot_be_opened_is_not_called_damaged(written, monkeypatch, reads, number):
+    def fails(*_, **__):
+        raise OSError(number, f"Unable to open file (errno = {number})")
+
+    monkeypatch.setattr(h5py, "File", fails)
+    with pytest.raises(InputError, match=os.strerror(number)) as error:
+        reads(written)
+    assert "damaged" not in str(error.value) and "elete" not in str(error.value)
+
+
+@pytest.mark.parametrize("reads", READERS.values(), ids=READERS)
+def test_a_file_without_locks_is_read(written, monkeypatch, reads):
+    opened = h5py.File
+
+    def without_locks(*arguments, locking=None):
+        if locking is not False:
+            raise OSError(errno.ENOLCK, "no locks")
+        return opened(*arguments, locking=locking)
+
+    monkeypatch.setattr(h5py, "File", without_locks)
+    assert reads(written)
+
+
+def test_a_file_that_another_program_writes_is_not_called_damaged(written):
+    with written.open("r+b") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)  # as h5py does
+        assert read_as_shard(written)  # is whole, whoever holds it
+        with pytest.raises(InputError, match="another program has it open for writing"):
+            read_as_annotation(written)
+        other.truncate(1000)
+        for reads in READERS.values():
+            with pytest.raises(InputError, match="another program") as error:
+                reads(written)
+            assert "damaged" not in str(error.value)
+    for reads in READERS.values():
+        with pytest.raises(InputError, match=r"truncated file.*damaged"):
+            reads(written)

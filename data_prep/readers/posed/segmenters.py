@@ -28,7 +28,7 @@ from data_prep.readers.posed.recording import INSTANCES, PosedFrame
 from sceneprior.core.checked import checked, plain
 from sceneprior.core.coco import paint
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import list_files, list_folders, read_json
+from sceneprior.core.files import check_file, list_files, list_folders, read_json
 from sceneprior.core.id_tables import LARGEST_ID, mask_size, read_class_table, read_mask
 
 MASKS, LABELS, PREFIX = "mask_data", "json_data", "mask_"
@@ -244,6 +244,7 @@ def _labels(path: Path) -> dict[int, str]:
 
 def _open(path: Path) -> np.ndarray:
     """An .npy of ids, (height, width), left on disk."""
+    check_file(path)
     try:
         ids = np.load(path, mmap_mode="r", allow_pickle=False)
     except Exception as error:  # numpy parses the header as Python, with errors of any type

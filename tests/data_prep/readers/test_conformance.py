@@ -3,16 +3,20 @@
 `TAKE=1 pytest tests/data_prep/readers/test_conformance.py` writes the golden file anew.
 """
 
+import os
+
 import numpy as np
 import pytest
 from golden_values import FOLDER, TAKE
 from toy_formats import FORMATS, arrays_of, read
 
+from data_prep.engine.source import pool
 from data_prep.inspection.agreement import boxes_around, hull_of
 from data_prep.inspection.verify import array_problems, mask_problems
 from data_prep.readers.upright import own_sides
 from sceneprior.core.cameras import camera_centers
 from sceneprior.core.classes import label_set
+from sceneprior.core.errors import InputError
 
 GOLDEN = FOLDER / "readers.npz"
 IMAGES = ("instance_ids", "stuff")
@@ -113,3 +117,76 @@ def test_things_are_where_their_masks_are(made, name):
     if not any("the floor is assumed" in note for note in room.notes):
         # Scans stand on their lowest piece, 5 cm above the floor.
         assert np.abs(np.median(eyes[:, 1] - toy.eyes_m[:, 2])) < 0.051
+
+
+def strangers(folder):
+    """Files as other systems leave them: dot files beside every file and folder, Windows' thumbs,
+    and texts that begin with a byte order mark."""
+    for path in sorted(folder.rglob("*")):
+        if path.suffix in (".json", ".csv", ".tsv", ".txt"):
+            path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+        if path.is_dir():
+            (path / "__MACOSX").mkdir()
+        for name in (f"._{path.name}", ".DS_Store", "Thumbs.db", f"__MACOSX/{path.name}"):
+            (path.parent / name).parent.mkdir(exist_ok=True)
+            (path.parent / name).write_bytes(b"\0\5\26\7")
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_files_of_other_systems_change_nothing(made, tmp_path, name):
+    arrays = arrays_of(read(name, tmp_path / "rooms", strangers)[0])
+    wanted = arrays_of(made(name)[0])
+    assert arrays.keys() == wanted.keys()
+    for key, array in arrays.items():
+        np.testing.assert_array_equal(array, wanted[key], key)
+
+
+def as_pipe(path):
+    os.mkfifo(path)
+
+
+def as_device(path):
+    path.symlink_to("/dev/zero")
+
+
+def as_loop(path):
+    path.symlink_to(path)
+
+
+def as_huge(path):
+    with path.open("wb") as file:
+        file.truncate(3 << 30)
+
+
+OTHERS = (as_pipe, as_device, as_loop, as_huge)
+
+
+def told_of(source) -> list[str]:
+    """Sentences of the rooms that are left out."""
+    try:
+        source.settings(None)
+        with pool(1) as run:
+            survey = source.survey(run)
+        for task in survey.rooms:
+            source.prepare(task, None)
+    except InputError as error:
+        return [str(error)]
+    return [line.reason for line in survey.left_out]
+
+
+@pytest.mark.parametrize("name", [name for name in FORMATS if "," not in name])
+def test_things_that_are_no_files_are_refused_in_a_sentence(tmp_path, name):
+    """One file of each kind that a format has is replaced, in turn, by a pipe, a device, a link to
+    itself or 3 GB."""
+    FORMATS[name](tmp_path / "whole")
+    paths = [path for path in (tmp_path / "whole").rglob("*") if path.is_file()]
+    first = {
+        (path.parent.name, path.suffix): path.relative_to(tmp_path / "whole") for path in paths
+    }
+    for number, kept in enumerate(first.values()):
+        folder = tmp_path / str(number)
+        source = FORMATS[name](folder).source
+        (folder / kept).unlink()
+        OTHERS[number % len(OTHERS)](folder / kept)
+        for sentence in told_of(source):
+            assert sentence.endswith(".") and "Error" not in sentence, (kept, sentence)

@@ -259,10 +259,14 @@ FORMATS: dict[str, Write] = {
 """Writes one room's files into an empty folder, and returns the source that reads them."""
 
 
-def read(name: str, folder: Path) -> tuple[PreparedRoom, Toy]:
-    """The only room of a format, read as the engine does; and what is true of it."""
+def read(
+    name: str, folder: Path, change: Callable[[Path], object] = id
+) -> tuple[PreparedRoom, Toy]:
+    """The only room of a format, read as the engine does; and what is true of it. `change` changes
+    its files before."""
     folder.mkdir(parents=True, exist_ok=True)
     made_of = FORMATS[name](folder)
+    change(folder)
     source = made_of.source
     source.settings(None)
     with pool(1) as run:
