@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
-from pydantic import BaseModel, Field, TypeAdapter
+from pydantic import BaseModel, Field, RootModel, model_validator
 
 from data_prep.engine.plan import digest
 from data_prep.engine.source import RoomTask
@@ -28,9 +28,9 @@ from data_prep.readers.annotations import read_hdf5, read_records
 from data_prep.readers.frames import GL_TO_CV, choose_frames, sampled
 from data_prep.readers.reader import FoundRoom, Reader, by_number
 from data_prep.readers.rooms import FramedRoom, numbered
-from sceneprior.core.checked import plain, shown
+from sceneprior.core.checked import checked, plain, shown
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import check_file, list_files, list_folders
+from sceneprior.core.files import list_files, list_folders, read_arrays
 from sceneprior.core.furniture import INFO_FILES, model_categories, tidy_category
 
 LABELS = "blender_label_mapping.csv"
@@ -49,12 +49,20 @@ class _Part(BaseModel):
     """Value in the frame's image of ids."""
     inst_mark: str
     """Name of the piece; its parts share it, and it is the same in all frames of a house."""
-    room_id: str
+    room_id: Annotated[str, Field(coerce_numbers_to_str=True)]
     jid: str = ""
     category_id: int = 0
 
+    @model_validator(mode="before")
+    @classmethod
+    def _tidied(cls, row: Any) -> Any:
+        if not isinstance(row, dict):
+            return row
+        return {key.removeprefix("cp_"): value for key, value in row.items() if value is not None}
 
-_PARTS = TypeAdapter(list[_Part])
+
+class _Parts(RootModel[list[_Part]]):
+    """All parts of a frame."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,19 +168,12 @@ def _read_frame(path: Path) -> tuple[np.ndarray, list[_Part]]:
         raise InputError(f"{path}: instance_segmaps is no image of ids; {_HINT}.")
     try:
         rows = json.loads(bytes(text[()]))
-        tidied = [
-            {key.removeprefix("cp_"): value for key, value in row.items() if value is not None}
-            for row in rows
-        ]
-        for row in tidied:
-            row["room_id"] = str(row["room_id"])
-        parts = _PARTS.validate_python(tidied)
-    except (ValueError, TypeError, AttributeError, KeyError) as error:
-        reason = plain(" ".join(str(error).split()), 120)
+    except (ValueError, TypeError, RecursionError) as error:
+        reason = plain(str(error), 120)
         raise InputError(
-            f"{path}: instance_attribute_maps is not a list with idx, inst_mark and room_id of "
-            f"each mesh ({reason}); {_HINT}."
+            f"{path}: instance_attribute_maps is not JSON ({reason}); {_HINT}."
         ) from None
+    parts = checked(_Parts, rows, f"{path}, instance_attribute_maps").root
     return image, [part for part in parts if part.inst_mark and "layout" not in part.inst_mark]
 
 
@@ -180,15 +181,10 @@ def _intrinsics(folder: Path) -> np.ndarray:
     """Intrinsics of all frames, (3, 3), with the centre of the first pixel at (0.5, 0.5)."""
     path = folder / "cam_K.npy"
     hint = "it is the camera matrix that the authors' script writes beside the houses"
-    check_file(path, hint=hint)
-    try:
-        K = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        reason = plain(str(error), 120)
-        raise InputError(f"{path} cannot be read ({reason}); {hint}.") from None
+    K = read_arrays(path, hint).get("", np.zeros(0))
+    K = K.astype(np.float64) if K.dtype.kind in "iuf" else np.zeros(0)
     if K.shape != (3, 3) or not np.isfinite(K).all() or min(K[0, 0], K[1, 1]) <= 0:
         raise InputError(f"{path} holds no camera matrix of 3 x 3 numbers.")
-    K = K.astype(np.float64)
     K[:2, 2] += 0.5
     return K
 

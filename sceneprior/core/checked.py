@@ -22,12 +22,18 @@ def checked(model: type[_M], data: Any, where: str) -> _M:
         first = error.errors(include_url=False)[0]
         if first["type"] == "value_error":
             raise InputError(f"{where}: {first['ctx']['error']}") from None
-        key, reason = ".".join(map(str, first["loc"])) or "it", first["msg"]
-        if first["type"] == "model_type":  # Pydantic's message names our class
-            reason = "expected a JSON object"
-        raise InputError(
-            f"{where}: {key} is {shown(first['input'])}; {reason[:1].lower()}{reason[1:]}."
-        ) from None
+        raise InputError(f"{where}: {fault_of(error)}.") from None
+
+
+def fault_of(error: ValidationError) -> str:
+    """Describe the first fault: the key, its value, and what was expected."""
+    first = error.errors(include_url=False)[0]
+    key, reason = ".".join(map(str, first["loc"])) or "it", first["msg"]
+    if first["type"] == "missing":  # its input is the whole object without the key
+        return f"{key} is missing"
+    if first["type"] == "model_type":  # Pydantic's message names our class
+        reason = "expected a JSON object"
+    return f"{key} is {shown(first['input'])}; {reason[:1].lower()}{reason[1:]}"
 
 
 def number_array(value: Any) -> np.ndarray:

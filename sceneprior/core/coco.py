@@ -122,6 +122,12 @@ def paint(masks: Iterable[tuple[int, np.ndarray]], size: tuple[int, int]) -> np.
 
 def decode(segmentation: Any, size: tuple[int, int], where: str) -> np.ndarray:
     """Decode polygons or run lengths, compressed or not, to a mask, (height, width) bool."""
+    if segmentation is None or segmentation == []:
+        raise InputError(
+            f"{where}: it has no mask (`segmentation` is empty), as if only boxes were drawn; "
+            "objects need masks: let a segmenter such as SAM 2 make them from the boxes, or remove "
+            "annotations without a mask."
+        )
     try:
         if isinstance(segmentation, list):
             return _inside(segmentation, size)

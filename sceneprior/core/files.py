@@ -11,7 +11,7 @@ import os
 import secrets
 import stat
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -263,6 +263,34 @@ def read_table(path: Path, hint: str = "", **dialect: Any) -> list[list[str]]:
         return list(csv.reader(io.StringIO(read_text(path, hint=hint)), **dialect))
     except csv.Error as error:
         raise _unread(path, str(error), hint) from None
+
+
+def read_arrays(path: Path, hint: str = "", only: Collection[str] = ()) -> dict[str, Any]:
+    """Read the arrays of an .npz by name, all or `only` these, or that of an .npy, named "".
+
+    They hold no Python objects, which could run code.
+
+    Raises:
+        InputError: the file cannot be read; `hint` says what it is.
+    """
+    import numpy as np  # here, because some commands do not need it
+
+    size = check_file(path, sys.maxsize, hint).st_size
+    try:
+        found = np.load(path, allow_pickle=False)
+        if isinstance(found, np.ndarray):
+            return {"": found}
+        with found:
+            if sum(each.file_size for each in found.zip.infolist()) > max(size, _MOST_BYTES):
+                raise ValueError("it has more than 2 GB")
+            return {name: found[name] for name in only or found if name in found}
+    except OSError as error:
+        raise _unread(path, cause_of(error), hint) from None
+    except Exception as error:  # NumPy parses headers as Python: the type depends on the damage
+        reason = ascii(" ".join(str(error).split())[:120])[1:-1] or type(error).__name__
+        if "pickle" in reason:  # NumPy says how to load it all the same
+            reason = "it holds no arrays, or Python objects"
+        raise _unread(path, reason, hint) from None
 
 
 def open_hdf5(path: Path, whole: bool = False) -> "h5py.File":

@@ -214,6 +214,8 @@ def _open(path: Path, rgb: bool) -> Image.Image:
         known = kind == (8, "RGB")
         if not rgb:
             wanted = "one channel of 8 or 16 bits, or a palette, whose values are instance ids"
+            if kind[1] in ("RGB", "RGBA"):
+                wanted += " (docs/posed_data.md turns colours into ids)"
             known = kind in ((8, "grey"), (16, "grey")) or kind[1] == "palette"
         if not known:
             raise InputError(f"{path} is {kind[0]}-bit {kind[1]}; expected {wanted}.")

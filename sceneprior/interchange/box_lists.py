@@ -12,7 +12,7 @@ from jaxtyping import Float
 from sceneprior.core.boxes import yaw_rotation
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import check_file, list_files, read_json, write_whole
+from sceneprior.core.files import list_files, read_arrays, read_json, write_whole
 from sceneprior.core.scene import Mesh, Scene, SceneObject, Turned, bound_m
 from sceneprior.core.scene_json import MOST_OBJECTS, check_box
 from sceneprior.core.shell import floor_polygon
@@ -76,19 +76,12 @@ def read_box_lists(
 
 
 def _records(path: Path) -> list[dict[str, Any]]:
-    check_file(path)
-    try:
-        if path.suffix == ".npz":
-            with np.load(path, allow_pickle=False) as file:
-                records = [{key: file[key] for key in (*NEEDED, *FLOOR) if key in file}]
-        else:
-            loaded = read_json(path)
-            records = loaded if isinstance(loaded, list) else [loaded]
-    except Exception as error:  # a damaged file raises almost anything in numpy
-        raise InputError(
-            f"{path} is not a box list ({type(error).__name__}); expected an .npz or .json with "
-            f"{', '.join(NEEDED)}."
-        ) from None
+    hint = f"expected a box list, an .npz or .json with {', '.join(NEEDED)}"
+    if path.suffix == ".npz":
+        records = [read_arrays(path, hint, (*NEEDED, *FLOOR))]
+    else:
+        loaded = read_json(path, hint=hint)
+        records = loaded if isinstance(loaded, list) else [loaded]
     if not all(isinstance(record, dict) for record in records):
         raise InputError(f"{path} is not a box list; expected objects with {', '.join(NEEDED)}.")
     missing = [key for key in NEEDED if any(key not in record for record in records)]

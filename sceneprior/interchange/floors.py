@@ -21,7 +21,7 @@ from scipy.sparse.csgraph import connected_components
 
 from sceneprior.core.checked import number_array, shown
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import check_file, read_json
+from sceneprior.core.files import read_arrays, read_json
 from sceneprior.core.scene import Opening
 from sceneprior.core.scene_json import FORMAT, check_floor, read_scene
 from sceneprior.core.shell import walls_of
@@ -139,13 +139,7 @@ def floor_outline(path: Path, room: dict[str, Any]) -> np.ndarray | None:
 
 
 def _atiss_floor(path: Path) -> np.ndarray:
-    check_file(path)
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            record = {key: file[key] for key in FLOOR if key in file}
-    except Exception as error:  # a damaged file raises almost anything in numpy
-        raise InputError(f"{path} cannot be read ({type(error).__name__}).") from None
-    outline_m = floor_outline(path, record)
+    outline_m = floor_outline(path, read_arrays(path, only=FLOOR))
     if outline_m is None:
         raise InputError(f"{path} has no floor; expected {', '.join(FLOOR)}.")
     return outline_m

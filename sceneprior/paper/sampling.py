@@ -16,7 +16,7 @@ from torch import Tensor
 
 from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.errors import InputError, InputWarning
-from sceneprior.core.files import write_whole
+from sceneprior.core.files import read_arrays, write_whole
 from sceneprior.core.repeatable import check_seed, single_threaded
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.views import DecodedScenes
@@ -197,17 +197,13 @@ def read_latent(trained: TrainedPrior, text: str) -> Float[Tensor, " dimension"]
     path, item = (Path(file), item) if file.endswith(".npz") else (Path(text), "0")
     if text in trained.room_ids or not path.is_file():
         return named_latent(trained, text, "a file of latents (.npz)")
-    try:
-        with np.load(path) as data:
-            latents = np.asarray(data["latents"], dtype=np.float64)
-            names = [str(name) for name in data.get("names", [])]
-        if latents.ndim != 2 or not latents.size:
-            raise ValueError(f"an array of shape {latents.shape}")
-    except Exception as error:  # NumPy's error depends on which byte is damaged
-        raise InputError(
-            f"{path} holds no latents ({type(error).__name__}: {error}); expected (n, D) numbers, "
-            "as in the latents.npz that `sceneprior synthesize` writes."
-        ) from None
+    hint = "expected (n, D) numbers, as in the latents.npz that `sceneprior synthesize` writes"
+    data = read_arrays(path, hint, ("latents", "names"))
+    latents, names = data.get("latents", np.zeros(0)), [*map(str, data.get("names", []))]
+    if latents.ndim != 2 or not latents.size or latents.dtype.kind not in "iuf":
+        came = f"{latents.dtype} of shape {latents.shape}" if "latents" in data else "none"
+        raise InputError(f"{path} holds no latents ({came}); {hint}.")
+    latents = latents.astype(np.float64)
     if item in names:
         row = names.index(item)
     elif item.isdecimal() and int(item) < len(latents):

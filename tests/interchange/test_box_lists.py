@@ -123,8 +123,8 @@ def test_what_is_no_box_list_is_a_sentence(tmp_path, changes, sentence):
 @pytest.mark.parametrize(
     ("name", "content", "sentence"),
     [
-        ("a.npz", "x", r"a\.npz is not a box list"),
-        ("a.json", "{", r"a\.json is not a box list"),
+        ("a.npz", "x", r"it holds no arrays, or Python objects\); expected a box list"),
+        ("a.json", "{", r"a\.json is not JSON .*; expected a box list"),
         ("a.json", "[1]", r"a\.json is not a box list"),
         ("a.json", '{"class_labels": [[1], [1, 2]], "translations": [], "sizes": [], "angles": []}',
          "class_labels, translations, sizes and angles must be"),

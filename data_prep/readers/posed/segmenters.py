@@ -28,7 +28,7 @@ from data_prep.readers.posed.recording import INSTANCES, PosedFrame
 from sceneprior.core.checked import checked, plain
 from sceneprior.core.coco import paint
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import check_file, list_files, list_folders, read_json
+from sceneprior.core.files import list_files, list_folders, read_arrays, read_json
 from sceneprior.core.id_tables import LARGEST_ID, mask_size, read_class_table, read_mask
 
 MASKS, LABELS, PREFIX = "mask_data", "json_data", "mask_"
@@ -192,7 +192,7 @@ class GroundedSam2(MaskFormat):
     def frames(self) -> dict[str, FrameMask]:
         return {
             path.stem.removeprefix(PREFIX): FrameMask(
-                partial(_size_of_ids, path),
+                lambda path=path: _read_ids(path).shape,
                 partial(_read_ids, path),
                 partial(_labels, self.folder / LABELS / f"{path.stem}.json"),
             )
@@ -214,14 +214,17 @@ class GroundedSam2(MaskFormat):
         return classes
 
 
-def _size_of_ids(path: Path) -> tuple[int, int]:
-    height, width = _open(path).shape
-    return height, width
-
-
 def _read_ids(path: Path) -> np.ndarray:
     """Ids of a frame, (height, width) int64."""
-    ids = np.array(_open(path)).astype(np.int64)
+    arrays = read_arrays(path, "write it again, as Grounded-SAM-2 does")
+    ids = arrays.get("", np.zeros(0))
+    if ids.ndim != 2 or not ids.size or ids.dtype.kind not in "iu":
+        found = f"{ids.dtype} of shape {ids.shape}" if "" in arrays else "an archive"
+        raise InputError(
+            f"{path} holds {found}; expected integer ids, (height, width), as Grounded-SAM-2 "
+            "writes them."
+        )
+    ids = ids.astype(np.int64)
     if ids.min(initial=0) < 0 or ids.max(initial=0) >= LARGEST_ID:
         raise InputError(
             f"{path} has ids from {ids.min()} to {ids.max()}; expected 0 to {LARGEST_ID - 1}, "
@@ -240,25 +243,6 @@ def _labels(path: Path) -> dict[int, str]:
                 f"from 1 to {LARGEST_ID - 1}."
             )
     return {int(key): label.class_name for key, label in labels.items()}
-
-
-def _open(path: Path) -> np.ndarray:
-    """An .npy of ids, (height, width), left on disk."""
-    check_file(path)
-    try:
-        ids = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as error:  # numpy parses the header as Python, with errors of any type
-        raise InputError(
-            f"{path} cannot be read as an .npy of numbers ({plain(str(error), 120)}); it may be "
-            "truncated: write it again."
-        ) from None
-    if isinstance(ids, np.ndarray) and ids.ndim == 2 and ids.size and ids.dtype.kind in "iu":
-        return ids
-    found = f"{ids.dtype} of shape {ids.shape}" if isinstance(ids, np.ndarray) else "an archive"
-    raise InputError(
-        f"{path} holds {found}; expected integer ids, (height, width), as Grounded-SAM-2 writes "
-        "them."
-    )
 
 
 class _Found(BaseModel):

@@ -11,6 +11,7 @@ model's file changes. The package's own furniture (`sceneprior/furniture`) is bu
 first needs its class, in 10 to 100 ms.
 """
 
+import contextlib
 import hashlib
 import io
 import os
@@ -26,7 +27,14 @@ from jaxtyping import Float
 
 from sceneprior.core.classes import LABEL_SETS, label_set
 from sceneprior.core.errors import InputError, InputWarning
-from sceneprior.core.files import file_stamp, is_name, list_files, list_folders, write_whole
+from sceneprior.core.files import (
+    file_stamp,
+    is_name,
+    list_files,
+    list_folders,
+    read_arrays,
+    write_whole,
+)
 from sceneprior.core.furniture import (
     INFO_FILES,
     MODEL_FILE,
@@ -293,11 +301,9 @@ def _points_of_models(
     settings = f"{folder.resolve()}|{POINTS}|{SEED}|{FORMAT}"
     kept = cached / f"points-{hashlib.sha256(settings.encode()).hexdigest()[:16]}.npz"
     before = dict[str, np.ndarray]()
-    try:
-        with np.load(kept, allow_pickle=False) as file:
-            before = dict(zip(file["keys"].tolist(), file["points"], strict=True))
-    except Exception:  # absent or damaged: points are sampled again
-        pass
+    with contextlib.suppress(InputError, KeyError, ValueError):  # absent or damaged: sampled again
+        file = read_arrays(kept)
+        before = dict(zip(file["keys"].tolist(), file["points"], strict=True))
     keys, broken = dict[str, str](), dict[str, str]()
     for model_id in sorted(m for m, label in files.labels.items() if label != "void"):
         try:

@@ -7,7 +7,6 @@ found again when its inputs or its version changes, and is left out if the folde
 import contextlib
 import hashlib
 import io
-import zipfile
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,8 +23,8 @@ from torch.nn.utils.rnn import pad_sequence
 from sceneprior.core.boxes import turn_boxes
 from sceneprior.core.classes import VOID
 from sceneprior.core.dataset import BLANK, RoomDataset, allowed_views
-from sceneprior.core.errors import ShardError
-from sceneprior.core.files import write_whole
+from sceneprior.core.errors import InputError, ShardError
+from sceneprior.core.files import read_arrays, write_whole
 from sceneprior.core.observations import RoomViews
 from sceneprior.core.parts import Parts, filled_cells
 from sceneprior.core.shards import Shard, iterate_rooms
@@ -264,12 +263,10 @@ def _cached(
 ) -> dict[str, np.ndarray]:
     """Read the arrays cached in a file under this key. If they are missing, compute them, and cache
     them if the file is writable."""
-    try:
-        with np.load(path) as saved:
-            if str(saved["key"]) == key:
-                return {name: saved[name] for name in saved.files}
-    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile):
-        pass  # missing or damaged: computed again
+    with contextlib.suppress(InputError):  # missing or damaged: computed again
+        saved = read_arrays(path)
+        if str(saved.get("key")) == key:
+            return saved
     found = find()
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, key=np.array(key), **found)

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationError, model_validator
 
-from sceneprior.core.checked import shown
+from sceneprior.core.checked import fault_of, shown
 from sceneprior.core.classes import label_set as label_set_of
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Opening, SceneObject
@@ -105,10 +105,7 @@ class RoomRequest(BaseModel):
                 if where is None
                 else f"{where} is not a request, which docs/requests.md describes"
             )
-            key, reason = ".".join(map(str, first["loc"])), first["msg"]
-            raise InputError(
-                f"{start}: {key} is {shown(first['input'])}; {reason[:1].lower()}{reason[1:]}."
-            ) from None
+            raise InputError(f"{start}: {fault_of(error)}.") from None
 
     @model_validator(mode="after")
     def _read(self) -> "RoomRequest":
