@@ -11,6 +11,7 @@ import os
 import secrets
 import stat
 import sys
+import warnings
 from collections.abc import Callable, Collection, Iterator
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -277,7 +278,8 @@ def read_arrays(path: Path, hint: str = "", only: Collection[str] = ()) -> dict[
 
     size = check_file(path, sys.maxsize, hint).st_size
     try:
-        found = np.load(path, allow_pickle=False)
+        with warnings.catch_warnings(action="ignore"):  # of Python, about damaged headers
+            found = np.load(path, allow_pickle=False)
         if isinstance(found, np.ndarray):
             return {"": found}
         with found:

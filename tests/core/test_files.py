@@ -5,11 +5,21 @@ import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
+from mutating import MUTATIONS, damaged_bytes
 from refusals import refused
 
 from sceneprior.core import files
-from sceneprior.core.files import PART, check_writable, only_writer, remove_parts, write_whole
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import (
+    PART,
+    check_writable,
+    only_writer,
+    read_arrays,
+    remove_parts,
+    write_whole,
+)
 
 
 def test_bytes_texts_and_functions_are_written_alike(tmp_path):
@@ -91,3 +101,23 @@ def test_whether_a_place_can_be_written_is_found_without_a_trace(tmp_path, monke
         check_writable(tmp_path / "new" / "scores.json")
     assert error.value.filename == str(tmp_path / "new" / "scores.json")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("name", "save"), [("a.npy", np.save), ("a.npz", np.savez_compressed)])
+def test_damaged_arrays_are_read_or_refused_in_one_sentence(tmp_path, name, save):
+    path, values = tmp_path / name, np.arange(12.0).reshape(3, 4)
+    save(path, values)
+    (found,) = read_arrays(path).values()
+    np.testing.assert_array_equal(found, values)
+    assert read_arrays(path, only=["b"]).keys() <= {""}
+    whole, refusals = path.read_bytes(), set()
+    for case in range(MUTATIONS):
+        path.write_bytes(damaged_bytes(whole, np.random.default_rng(case)))
+        try:
+            read_arrays(path, "write it again")
+        except InputError as error:
+            refusals.add(str(error))
+    assert len(refusals) > 5
+    for text in refusals:
+        assert text.startswith(f"{path} cannot be read (") and text.endswith("; write it again.")
+        assert text.isprintable() and len(text) < 400

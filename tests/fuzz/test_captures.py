@@ -100,7 +100,7 @@ FILES = {
         ".sens", ".txt", ".aggregation.json", "_vh_clean_2.0.010000.segs.json",
         "_2d-instance-filt.zip", "_vh_clean_2.ply",
     )],
-    "blenderproc": ["model_info.json", "house/1.hdf5"],
+    "blenderproc": ["model_info.json", "house/1.hdf5", "cam_K.npy"],
     "hypersim": ["metadata_camera_parameters.csv", f"{SCENE}/_detail/metadata_scene.csv",
                  f"{SCENE}/_detail/cam_00/camera_keyframe_positions.hdf5"],
     "structured3d": ["scene_00007/annotation_3d.json", "scene_00007/bbox_3d.json",
