@@ -115,6 +115,8 @@ SIDES = 16
 OVERLAP = 5e-4
 """Length by which each part grows, as a share of the box, so that parts which touch become one
 solid."""
+SAME = 1e-6
+"""Distance, as a share of the box, up to which vertices of a mesh count as equal."""
 THIN_M = 0.08
 """Thickness up to which a part keeps its size in metres when its object is stretched."""
 MOST_THIN = 0.7
@@ -127,19 +129,36 @@ def surface_of_parts(
     """Vertices, in the frame of the object's box, and outward triangles of the union of all parts
     within the outline.
 
-    The mesh is closed: every edge belongs to two triangles.
+    The mesh is closed, even once equal vertices are merged: every edge belongs to two triangles.
     """
     from manifold3d import Manifold, OpType  # imported here: reading a scene does not need it
 
-    grown = np.array([-OVERLAP, OVERLAP])
-    solids = [
-        Manifold.hull_points(solid_points(kind, ends + grown)) for kind, ends in parts.solids()
-    ]
-    united: Manifold = Manifold.batch_boolean(solids, OpType.Add)
-    if not np.array_equal(parts.outline, SQUARE):
-        united = united ^ prism(parts.outline, -1.0, 1.0)
-    vertices, faces = triangles_of(united.simplify(OVERLAP))
-    return vertices.clip(-0.5, 0.5), faces
+    # Parts may touch in a single edge, which four triangles share; grown by other lengths, each by
+    # its own, they do not.
+    for more in range(8):
+        grown = OVERLAP * np.array([-1.0, 1.0])
+        solids = [
+            Manifold.hull_points(solid_points(kind, ends + grown * (1 + more * (0.3 + row / 7))))
+            for row, (kind, ends) in enumerate(parts.solids())
+        ]
+        united: Manifold = Manifold.batch_boolean(solids, OpType.Add)
+        if not np.array_equal(parts.outline, SQUARE):
+            united = united ^ prism(parts.outline, -1.0, 1.0)
+        # Cutting to the box moves corners onto each other, so edges without length are removed.
+        within = united.simplify(OVERLAP).warp_batch(lambda points: points.clip(-0.5, 0.5))
+        vertices, faces = triangles_of(within.simplify(10 * SAME))
+        if is_closed(vertices, faces):
+            break
+    return vertices, faces
+
+
+def is_closed(vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]) -> bool:
+    """True if, once vertices within `SAME` are merged, every edge has a face on either side."""
+    merged = np.unique((vertices / SAME).round(), axis=0, return_inverse=True)[1].reshape(-1)
+    start, end = merged[faces].ravel(), merged[np.roll(faces, -1, axis=1)].ravel()
+    edges = np.sort(start * len(vertices) + end)
+    backwards = np.sort(end * len(vertices) + start)
+    return bool((start != end).all() and np.diff(edges).all() and np.array_equal(edges, backwards))
 
 
 def convex_surface(

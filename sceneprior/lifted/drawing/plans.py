@@ -25,7 +25,7 @@ from sceneprior.lifted.sampler.network import EncoderState, RoomSampler
 RECTANGLES = 16
 """Rectangles sampled for a room without a requested floor. The first one that contains the given
 objects and is large enough for the required ones is taken, or else the largest."""
-BEYOND_M = 0.01
+BEYOND_M = 0.001
 """Distance that an object may extend beyond the rectangle."""
 FULL_SHARE = 0.5
 """Largest share of a drawn rectangle that the mean footprints of required objects cover."""

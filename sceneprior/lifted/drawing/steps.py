@@ -213,8 +213,7 @@ class _Step:
         sampler, plans = self.particles.sampler, self.particles.plans
         label, pieces_m, ceiling_m = self.label[at], plans.pieces_m[self.room[at]], plans.ceiling_m
         look = draw_index(self.logits[at], uniform[:, 0])
-        size_m = sampler.draw_size(look, uniform[:, 1])
-        bottom_m = sampler.bottom_m(look, size_m)
+        size_m, bottom_m = sampler.draw_size(look, uniform[:, 1])
         if ceiling_m is not None:
             highest_m = (ceiling_m - size_m[:, 1]).clamp(min=0)
             lower_m = torch.minimum(bottom_m, highest_m)

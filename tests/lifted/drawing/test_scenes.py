@@ -5,22 +5,28 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import shapely
+import trimesh
 from refusals import refused
 
 import sceneprior
 from sceneprior.apps.config import load_run
+from sceneprior.apps.priors.packed import shipped_priors
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.classes import label_set
+from sceneprior.core.colliders import HUNG
 from sceneprior.core.errors import InputWarning
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.lifted.drawing.draw import draw_rooms
+from sceneprior.lifted.drawing.plans import BEYOND_M
 from sceneprior.lifted.lifting import HANGS_M
+from sceneprior.lifted.prototypes import POSES
 from sceneprior.lifted.requests.wishes import Conditions
 from sceneprior.paper.sampling import draw_latents
 
 L_SHAPE = [[0, 0], [5, 0], [5, 3], [2.5, 3], [2.5, 6], [0, 6]]
-EDGE_M = 0.015
-"""Furniture may extend beyond the floor by a centimetre."""
+EDGE_M = BEYOND_M + 1e-4
+"""Floors in scenes are written to the millimetre."""
+SMALL = pytest.mark.filterwarnings("ignore:The floor of")
 BED = SceneObject("double_bed", (0.2, 0.3, -0.9), (1.7, 0.6, 2.1))
 
 
@@ -69,12 +75,28 @@ def test_floors_unlike_those_of_training_rooms_are_noted(prior, floor, said):
 
 
 @pytest.mark.filterwarnings("error::sceneprior.core.errors.InputWarning")
-@pytest.mark.parametrize("floor", ["4x3", L_SHAPE, [[0, 0], [4, 0], [5, 3], [2, 4], [0, 3]]])
-def test_furniture_stays_on_the_floor(prior, floor):
-    for room in prior.sample(4, seed=0, floor=floor):
-        assert room.objects and room.floor_m is not None
+@pytest.mark.parametrize("name", shipped_priors())
+@pytest.mark.parametrize("floor", [
+    L_SHAPE, [[0, 0], [4, 0], [5, 3], [2, 4], [0, 3]], pytest.param("2.4x2.1", marks=SMALL)
+])  # fmt: skip
+def test_furniture_stands_on_the_floor_and_stays_on_it(name, floor):
+    for room in sceneprior.load(name).sample(32, seed=3, floor=floor):
+        assert room.floor_m is not None
         assert np.allclose(room.floor_m.min(axis=0) + room.floor_m.max(axis=0), 0)
         assert_on_floor(room)
+        for item in room.objects:
+            assert item.label in HUNG or item.center_m[1] == pytest.approx(item.size_m[1] / 2)
+
+
+@pytest.mark.parametrize("name", shipped_priors())
+def test_meshes_of_all_prototypes_are_closed_when_a_program_merges_their_vertices(name):
+    """In single precision, as GLBs hold them, and 5 m from the origin."""
+    shapes = sceneprior.load(name).trained.prior.shape
+    for prototype in shapes.known:
+        box_m = np.array([5.0, 0.4, -3.0, *(shapes.sizes_m[prototype].numpy() * 1.1)])
+        mesh = shapes.mesh(prototype * POSES + 3, box_m)
+        merged = trimesh.Trimesh(mesh.vertices_m.astype(np.float32), mesh.faces)
+        assert merged.is_volume and len(merged.faces) == len(mesh.faces), prototype
 
 
 def test_counts_hold_exactly(prior):
