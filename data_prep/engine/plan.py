@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
 from data_prep.engine.source import Line, RoomTask, Source, Survey
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import list_files, read_table
+from sceneprior.core.files import list_files, read_table, reading
 from sceneprior.core.shards import INDEX_NAME, SPLITS
 
 PLAN_NAME = "plan.json"
@@ -68,7 +68,11 @@ def read_plan(out: Path, source: Source, settings: dict[str, Any], renderer: str
         if list_files(out, "*.h5", deep=True) or (out / INDEX_NAME).exists():
             raise InputError(f"{out} holds shards without a {PLAN_NAME}; choose a new folder.")
         return None
-    try:
+
+    def damaged(_: Exception) -> InputError:
+        return InputError(f"{path} cannot be read; choose a new folder, or delete {out}.")
+
+    with reading(path, damaged):
         data = json.loads(path.read_bytes())
         before = dict(data["settings"])
         if (version := before["plan_version"]) != PLAN_VERSION:
@@ -76,8 +80,6 @@ def read_plan(out: Path, source: Source, settings: dict[str, Any], renderer: str
             raise InputError(f"{path} {why}; choose a new folder, or delete {out}.")
         drawn_with = before.pop("renderer")
         plan = TypeAdapter(JobPlan).validate_python(data)
-    except (OSError, ValidationError, json.JSONDecodeError, KeyError, TypeError):
-        raise InputError(f"{path} cannot be read; choose a new folder, or delete {out}.") from None
     if source.only is not None and before.get("only", "") is None:
         settings = job_settings(source, None)
     changed = [key for key in settings if before.get(key) != settings[key]]

@@ -9,6 +9,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -220,6 +221,7 @@ def _tracked(items: list[Any], title: str | None) -> Iterable[Any]:
 
 
 def _start_worker() -> None:
+    warnings.simplefilter("ignore", RuntimeWarning)  # as in `warnings_as_sentences`
     # llvmpipe's own threads would compete with the other workers for the same cores.
     os.environ.setdefault("LP_NUM_THREADS", "1")
     parent = multiprocessing.parent_process()

@@ -64,9 +64,9 @@ def sentence_of(error: Exception) -> str | None:
     return None
 
 
-def cause_of(error: OSError) -> str:
+def cause_of(error: Exception) -> str:
     """Why a file cannot be read, and what to do: 'Permission denied: change its permissions'."""
-    if error.errno is None:
+    if not isinstance(error, OSError) or error.errno is None:
         return " ".join(str(error).split())[:200] or type(error).__name__
     advice = _ADVICE.get(error.errno) if error.errno != errno.ENOENT else None
     return os.strerror(error.errno) + (f": {advice}" if advice else "")

@@ -234,7 +234,7 @@ def read_bytes(path: Path, most: int = _MOST_BYTES, hint: str = "") -> bytes:
         raise _unread(path, cause_of(error), hint) from None
 
 
-def _unread(path: Path, reason: str, hint: str = "") -> InputError:
+def _unread(path: Path | str, reason: str, hint: str = "") -> InputError:
     return InputError(f"{path} cannot be read ({reason}){'; ' if hint else ''}{hint}.")
 
 
@@ -296,7 +296,7 @@ def read_arrays(path: Path, hint: str = "", only: Collection[str] = ()) -> dict[
 
 
 def open_hdf5(path: Path, whole: bool = False) -> "h5py.File":
-    """Open an HDF5 file for reading; use it, and read from it, within `hdf5_errors`.
+    """Open an HDF5 file for reading; use it, and read from it, within `reading`.
 
     `whole` says that no program writes to such files in place, as `write_whole` does not: they are
     read without locks, which many network folders lack. Other files are read without only where
@@ -315,18 +315,19 @@ def open_hdf5(path: Path, whole: bool = False) -> "h5py.File":
 
 
 @contextlib.contextmanager
-def hdf5_errors(path: Path, damaged: Callable[[str], InputError]) -> Iterator[None]:
-    """Raise errors of the system as such, and any other as that of a `damaged` file, by reason."""
+def reading(path: Path, damaged: Callable[[Exception], InputError]) -> Iterator[None]:
+    """Raise errors of the system, such as of permissions, as such; others as that of a `damaged`
+    file, whose library may raise anything."""
     try:
         yield
     except MemoryError:
-        raise
-    except Exception as error:  # the type that h5py raises depends on the damage
+        raise _unread(path, "it needs more memory than is free, or is damaged") from None
+    except Exception as error:
         if isinstance(error, InputError) and str(path) in str(error):
             raise
         if isinstance(error, OSError) and error.errno is not None:
-            raise _unread(path, cause_of(error)) from None
-        raise damaged(" ".join(str(error).split())[:200] or type(error).__name__) from None
+            raise _unread(error.filename or path, cause_of(error)) from None
+        raise damaged(error) from None
 
 
 def is_name(text: Any) -> bool:

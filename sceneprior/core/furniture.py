@@ -14,7 +14,7 @@ import numpy as np
 
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import read_json
+from sceneprior.core.files import check_file, read_json
 from sceneprior.core.scene import Mesh
 
 MODEL_FILE = "raw_model.obj"
@@ -101,6 +101,7 @@ def read_obj(path: Path) -> Mesh:
     """Read the triangles of a Wavefront OBJ, without materials, normals and unused vertices."""
     vertices: list[list[str]] = []
     polygons: list[list[str]] = []
+    check_file(path)
     try:
         with path.open(encoding="utf-8", errors="replace") as file:
             for line in file:

@@ -10,6 +10,7 @@ import numpy as np
 
 from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.errors import InputError, ShardError
+from sceneprior.core.files import check_file, reading
 from sceneprior.core.scene import Mesh, Scene, SceneObject, mesh_of_file
 from sceneprior.core.shards import MODELS_FOLDER, Shard, iterate_rooms, splits_of
 
@@ -160,14 +161,16 @@ def load_model(path: Path) -> Mesh:
         )
     import trimesh
 
-    try:
-        model = trimesh.load_mesh(path, process=False)
-        return mesh_of_file(np.asarray(model.vertices, dtype=np.float64), model.faces)
-    except Exception as error:  # the type that trimesh raises depends on the damage
-        raise ShardError(
+    def damaged(error: Exception) -> ShardError:
+        return ShardError(
             f"{path} is not a triangle mesh ({type(error).__name__}: {error}). Delete it and run "
             "`sceneprior prep-front` again."
-        ) from None
+        )
+
+    check_file(path)
+    with reading(path, damaged):
+        model = trimesh.load_mesh(path, process=False)
+        return mesh_of_file(np.asarray(model.vertices, dtype=np.float64), model.faces)
 
 
 read_model = lru_cache(maxsize=4096)(load_model)

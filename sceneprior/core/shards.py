@@ -12,7 +12,7 @@ from zlib_ng import zlib_ng
 
 from sceneprior.core.classes import STUFF, label_set
 from sceneprior.core.errors import ShardError
-from sceneprior.core.files import hdf5_errors, is_name, list_files, open_hdf5, read_json
+from sceneprior.core.files import cause_of, is_name, list_files, open_hdf5, read_json, reading
 from sceneprior.core.observations import RoomGroundTruth, RoomViews, stuff_size, thinned
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ class Shard(contextlib.AbstractContextManager["Shard"]):
         self.path = Path(path)
         if not self.path.is_file():
             raise ShardError(f"No shard at {path}; {PREPARE} writes shards.")
-        with hdf5_errors(self.path, lambda reason: _damaged(self.path, reason)):
+        with reading(self.path, lambda error: _damaged(self.path, error)):
             self._file = open_hdf5(self.path, whole=True)
             form = _decoded(self._file.attrs.get("format"))
             version = self._file.attrs.get("version")
@@ -95,7 +95,7 @@ class Shard(contextlib.AbstractContextManager["Shard"]):
     @contextlib.contextmanager
     def _group(self, room_id: str) -> Iterator["h5py.Group"]:
         """Open a room's group; errors in the block are raised as damage of the shard."""
-        with hdf5_errors(self.path, lambda reason: _damaged(self.path, reason, room_id)):
+        with reading(self.path, lambda error: _damaged(self.path, error, room_id)):
             yield self._file["rooms"][self._keys[room_id]]
 
     def read_room(self, room_id: str, images: bool = False) -> RoomViews:
@@ -271,10 +271,10 @@ def _inflate(images: "h5py.Dataset", view: int) -> np.ndarray:
     )
 
 
-def _damaged(path: Path, reason: str, room_id: str = "") -> ShardError:
+def _damaged(path: Path, error: Exception, room_id: str = "") -> ShardError:
     where = f", room {room_id}" if room_id else ""
     return ShardError(
-        f"{path}{where} cannot be read ({reason}): the file is damaged. "
+        f"{path}{where} cannot be read ({cause_of(error)}): the file is damaged. "
         f"Delete it and run the same {PREPARE} command again."
     )
 

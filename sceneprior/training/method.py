@@ -24,6 +24,7 @@ from torch import nn
 
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import ConfigError, InputError
+from sceneprior.core.files import check_file, reading
 from sceneprior.core.repeatable import LARGEST_SEED
 from sceneprior.core.scene import Mesh
 from sceneprior.core.settings import Section, shortened
@@ -320,13 +321,16 @@ def find_checkpoint(run: Path, stages: Sequence[str]) -> tuple[str, Path]:
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
     """The contents of a checkpoint: tensors and plain data only."""
-    try:
-        saved = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:
-        raise InputError(
+
+    def damaged(error: Exception) -> InputError:
+        return InputError(
             f"{path} cannot be read ({type(error).__name__}); it is damaged. Delete it and run "
             "`sceneprior fit` with `--resume`."
-        ) from None
+        )
+
+    check_file(path)
+    with reading(path, damaged):
+        saved = torch.load(path, map_location="cpu", weights_only=True)
     if not isinstance(saved, dict) or not isinstance(saved.get("state_dict"), dict):
         raise InputError(
             f"{path} is not a checkpoint of `sceneprior fit` (it has no state_dict). Delete it and "

@@ -4,6 +4,7 @@
 """
 
 import atexit
+import io
 import os
 import signal
 import sys
@@ -22,6 +23,7 @@ def main() -> None:
     """Run the command; an error in the input prints one sentence and exits with status 2."""
     with answering_ctrl_c() as was_pressed:
         try:
+            _prepare_environment()
             from sceneprior.apps.cli.commands import app
 
             with warnings_as_sentences():
@@ -37,6 +39,16 @@ def main() -> None:
             if was_pressed():
                 _stopped()  # some libraries turn the KeyboardInterrupt into another error
             _failed(error)
+
+
+def _prepare_environment() -> None:
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal may not know a letter of a path
+        sys.stdout.reconfigure(errors="backslashreplace")
+    threads = os.environ.get("NUMBA_NUM_THREADS") or "1"
+    if not threads.isdecimal() or int(threads) == 0:  # numba's own error does not name it
+        from sceneprior.core.errors import InputError
+
+        raise InputError(f"NUMBA_NUM_THREADS is '{threads}', expected 1 or more; unset it.")
 
 
 def _stopped() -> NoReturn:
@@ -62,10 +74,12 @@ def _failed(error: Exception) -> NoReturn:
 
 @contextmanager
 def warnings_as_sentences() -> Iterator[None]:
-    """Print each `InputWarning` without the source line that Python adds."""
+    """Print each `InputWarning` without the source line that Python adds; hide NumPy's warnings of
+    numbers in damaged files, for which a sentence follows."""
     from sceneprior.core.errors import InputWarning
 
     with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
         show = warnings.showwarning
 
         def say(message: Warning | str, category: type[Warning], *where: Any, **to: Any) -> None:

@@ -139,7 +139,7 @@ def pack(
     from sceneprior.apps.priors.card import model_card
     from sceneprior.apps.priors.packed import pack as packed_of
     from sceneprior.apps.priors.packed import write_packed
-    from sceneprior.core.files import read_json
+    from sceneprior.core.files import read_bytes, read_json
     from sceneprior.lifted.config import SAMPLER
     from sceneprior.paper.prior import TrainedPrior
 
@@ -147,9 +147,7 @@ def pack(
         raise InputError(f"{out} already exists; name another file, or add --overwrite.")
     found = scores or run / "scores.json"
     measured = read_json(found) if scores is not None or found.is_file() else None
-    if about is not None and not about.is_file():  # devices and pipes may be endless
-        raise InputError(f"{about} cannot be read: it is missing or not a regular file.")
-    stated = None if about is None else about.read_text(errors="replace")
+    stated = None if about is None else read_bytes(about).decode(errors="replace")
     run_config(run)
     trained = load_any_run(run)
     card = model_card(trained, out.stem, stated, measured, latents, half)

@@ -28,7 +28,7 @@ from torch.overrides import TorchFunctionMode
 from sceneprior.core.boxes import QUARTERS
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import json_text, write_whole
+from sceneprior.core.files import check_file, json_text, read_bytes, reading, write_whole
 from sceneprior.core.parts import KINDS
 from sceneprior.core.settings import Section, check_settings
 from sceneprior.lifted.config import TrainedLifted
@@ -200,7 +200,15 @@ def is_packed(path: Path) -> bool:
 
 def read_packed(path: Path) -> PackedPrior:
     """Read a packed prior. Nothing in it is executed, and nothing is written."""
-    try:
+
+    def damaged(error: Exception) -> InputError:
+        reason = " ".join(str(error).split())[:200]
+        return InputError(
+            f"{path} is not a packed prior, or is damaged ({type(error).__name__}: {reason}); "
+            "fetch it again, or have it packed again with `sceneprior pack RUN --out FILE`."
+        )
+
+    with reading(path, damaged):
         card, described, weights = (_contents(path, name) for name in FILES)
         data = json.loads(described)
         if (data["format"], data["version"]) != (FORMAT, VERSION):
@@ -210,23 +218,16 @@ def read_packed(path: Path) -> PackedPrior:
             )
         said = check_settings(Description, data, CONFIG)
         return PackedPrior(said, read_tensors(weights), card.decode())
-    except Exception as error:  # a damaged file raises almost anything in zipfile and safetensors
-        reason = " ".join(str(error).split())[:200]
-        raise InputError(
-            f"{path} is not a packed prior, or is damaged ({type(error).__name__}: {reason}); "
-            "fetch it again, or have it packed again with `sceneprior pack RUN --out FILE`."
-        ) from None
 
 
 def _contents(path: Path, name: str) -> bytes:
     """Read one file of a packed prior, of at most `LARGEST` bytes."""
     most = LARGEST[name]
     if path.is_dir():
-        with (path / name).open("rb") as file:
-            content = file.read(most + 1)
-    else:
-        with zipfile.ZipFile(path) as archive, archive.open(name) as member:
-            content = member.read(most + 1)
+        return read_bytes(path / name, most, f"{path} is not a packed prior")
+    check_file(path)
+    with zipfile.ZipFile(path) as archive, archive.open(name) as member:
+        content = member.read(most + 1)
     if len(content) > most:
         raise ValueError(f"{name} has more than {most} bytes")
     return content

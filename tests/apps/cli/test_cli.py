@@ -1,17 +1,22 @@
 """The entry point: one sentence for what does not work, and nothing half-written."""
 
 import errno
+import io
 import os
 import shutil
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
+import numpy as np
 import pytest
 from cli_helpers import one_sentence, refuses
 from tiny_runs import write_tiny_config
 
+from sceneprior.apps import cli
 from sceneprior.core import files
+from sceneprior.core.errors import InputWarning
 from sceneprior.core.shards import list_shards
 
 
@@ -55,6 +60,38 @@ def test_unforeseen_errors_are_one_line_and_status_1(command, monkeypatch):
 def test_what_the_system_refuses_is_a_sentence(command, monkeypatch, name):
     monkeypatch.setattr("sceneprior.apps.config.load_config", refuse(getattr(errno, name)))
     refuses(command, f"cli/system_{name}", "fit", "--config", "demo.yaml")
+
+
+@pytest.mark.parametrize("threads", ["0", "x", "-1"])
+def test_a_variable_that_numba_would_trip_over_is_named(command, monkeypatch, threads):
+    monkeypatch.setenv("NUMBA_NUM_THREADS", threads)
+    assert "NUMBA_NUM_THREADS" in one_sentence(command("fit", "--config", "demo.yaml"))
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "ascii", "utf-8"])
+def test_a_terminal_prints_what_it_cannot(monkeypatch, encoding):
+    written = io.BytesIO()
+    monkeypatch.setattr("sceneprior.apps.cli.commands.app", lambda: print("caf\xe9 \u2603 \udcff"))
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(written, encoding))
+    cli.main()
+    sys.stdout.flush()
+    assert written.getvalue().startswith(b"caf") and written.getvalue().endswith(b"\\udcff\n")
+
+
+def test_numbers_in_damaged_files_are_no_warning(monkeypatch, capsys):
+    def app():
+        np.array([np.inf]) * 0
+        warnings.warn("a file is odd.", InputWarning, stacklevel=1)
+
+    monkeypatch.setattr("sceneprior.apps.cli.commands.app", app)
+    cli.main()
+    assert capsys.readouterr().err == "Warning: a file is odd.\n"
+
+
+@pytest.mark.parametrize("out", ["loop", "loop/x"])
+def test_a_link_to_itself_is_a_sentence(command, out):
+    Path("loop").symlink_to("loop")
+    one_sentence(command("synthesize", "--run", "demo-bedroom", "-n", 1, "--out", out))
 
 
 @pytest.mark.parametrize(
