@@ -40,17 +40,17 @@ MAY_TOO = {
 }
 
 BUDGET = {
-    "data_prep": (12315, 58),
-    "sceneprior/core": (5645, 28),
+    "data_prep": (12320, 58),
+    "sceneprior/core": (5650, 28),
     "sceneprior/furniture": (572, 4),
     "sceneprior/render": (4489, 23),
-    "sceneprior/training": (866, 5),
+    "sceneprior/training": (870, 5),
     "sceneprior/paper": (2405, 12),
     "sceneprior/lifted": (7739, 38),
     "sceneprior/baselines": (2909, 14),
     "sceneprior/evaluation": (4136, 20),
     "sceneprior/interchange": (892, 5),
-    "sceneprior/apps": (6200, 34),
+    "sceneprior/apps": (6213, 34),
 }
 """Most lines and modules of a folder. They go down freely, and up only in a commit that says what
 it bought and what went for it."""
