@@ -16,6 +16,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from sceneprior.core.boxes import BOX_FACES, box_corners
 from sceneprior.core.classes import class_colors
+from sceneprior.core.files import file_name_of
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 
 BACKGROUND = (255, 255, 255)
@@ -84,8 +85,8 @@ def shell_color(node: str) -> UInt8[np.ndarray, "3"]:
 
 
 def node_names(scene: Scene) -> list[str]:
-    """Names of the objects in files: `<index>_<class>`."""
-    return [f"{index}_{item.label}" for index, item in enumerate(scene.objects)]
+    """Names of the objects in files, and of their files: `<index>_<class>`, as `file_name_of`."""
+    return [file_name_of(f"{index}_{item.label}") for index, item in enumerate(scene.objects)]
 
 
 def linear_rgba(color: UInt8[np.ndarray, "3"]) -> list[float]:

@@ -14,7 +14,7 @@ from sceneprior.apps.rooms import write_scenes
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.interchange.box_lists import read_box_lists
-from sceneprior.interchange.export import export_scenes
+from sceneprior.interchange.export import SIMULATORS, export_scenes
 from sceneprior.render.scene_files import load_scene_folder
 
 BEDROOM = "front3d_bedroom"
@@ -102,3 +102,27 @@ def test_what_cannot_be_exported_is_a_sentence(scenes, tmp_path, monkeypatch):
     ):
         with pytest.raises(InputError, match=sentence):
             export_scenes(rooms, to, tmp_path, shell)
+
+
+ODD = ("tv/stereo", "../up", "..", "a:b?", "床" * 60)
+
+
+@pytest.mark.parametrize("to", [*SIMULATORS, "sceneeval", "obj", "scenes"])
+def test_no_class_leads_out_of_a_folder(tmp_path, to):
+    if to == "usd":
+        pytest.importorskip("pxr", reason="the extra `usd` is not installed")
+    names = ",".join(("void", *ODD))
+    objects = [SceneObject(c, (2.0 * i, 0.5, 0.0), (1.0, 1.0, 1.0)) for i, c in enumerate(ODD)]
+    there = {}
+    for plain in (False, True):
+        out = tmp_path / str(plain) / "out"
+        items = [replace(o, label="bed") for o in objects] if plain else objects
+        scene = Scene("room", "void,bed" if plain else names, tuple(items), FLOOR * 9)
+        if to == "scenes":
+            write_scenes([scene], out)
+            assert [o.label for o in load_scene_folder(out)[0].objects] == [o.label for o in items]
+        else:
+            export_scenes([scene], to, out)
+        depths = [len(path.relative_to(out.parent).parts) for path in out.parent.rglob("*")]
+        there[plain] = sorted(depths)
+    assert there[False] == there[True]
