@@ -43,7 +43,7 @@ BUDGET = {
     "data_prep": (12320, 58),
     "sceneprior/core": (5650, 28),
     "sceneprior/furniture": (572, 4),
-    "sceneprior/render": (4489, 23),
+    "sceneprior/render": (4490, 23),
     "sceneprior/training": (870, 5),
     "sceneprior/paper": (2405, 12),
     "sceneprior/lifted": (7739, 38),
