@@ -122,6 +122,8 @@ def _train(
 ) -> None:
     """Train one stage in its folder to the end, or until Ctrl-C."""
     settings = stage.settings
+    # Before anything is computed, since the prototypes' codes depend on the rounding of sums, too.
+    torch.set_num_threads(settings.cpu_threads or 1)
     rooms = stage.open_data()
     module = stage.build(rooms, previous)
     latents = getattr(module, "latents", None)
@@ -138,8 +140,6 @@ def _train(
     warnings.filterwarnings("ignore", module="lightning")
     torch.set_float32_matmul_precision("high")
     lightning.seed_everything(config.seed, verbose=False)
-    if settings.cpu_threads is not None:
-        torch.set_num_threads(settings.cpu_threads)
     updates: dict[str, Any] = {
         "gradient_clip_val": settings.clip_gradient or None,
         "accumulate_grad_batches": settings.accumulate,

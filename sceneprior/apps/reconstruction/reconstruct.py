@@ -18,6 +18,7 @@ from sceneprior.core.cameras import Pinhole, boxes_of_points, pixel_rays
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import write_whole
+from sceneprior.core.repeatable import single_threaded
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.views import ObservedImage, SceneViews, as_views, rows_of
 from sceneprior.evaluation.page import png_uri, write_rooms_page
@@ -75,6 +76,7 @@ class Reconstruction:
     """See `ObjectAnswer.taken_for`."""
 
 
+@single_threaded()
 def reconstruct(
     trained: Trained,
     images: Sequence[ObservedImage],
