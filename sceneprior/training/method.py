@@ -77,9 +77,8 @@ class TrainConfig(Section):
     clip_gradient: float = Field(0.0, ge=0)
     """Norm to which gradients are clipped; 0 turns clipping off."""
     cpu_threads: int | None = Field(None, ge=1)
-    """Torch threads when training on a CPU; None is 1. The last bits of weights depend on it, since
-    sums round differently. A small network gains little from a second thread, and loses much when
-    another program uses that core."""
+    """Torch threads on a CPU; None is 1. A second one changes the last bits of weights, speeds up a
+    small network little, and slows it down much when another program uses that core."""
 
 
 def without_samples(data: dict[str, Any], source: str) -> dict[str, Any]:

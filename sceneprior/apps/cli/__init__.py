@@ -15,8 +15,6 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any, NoReturn
 
-ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""Environment variables that set the threads of OpenMP and of the libraries of linear algebra."""
 AGAIN_S = 0.5
 """Seconds until a dropped KeyboardInterrupt is raised again."""
 
@@ -25,7 +23,8 @@ def main() -> None:
     """Run the command; an error in the input prints one sentence and exits with status 2."""
     # Read by libraries that are imported later. Sums over several threads round differently, so
     # results would depend on the machine; `fit` gives torch the number of threads in its config.
-    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
+    for library in ("OMP", "OPENBLAS", "MKL"):
+        os.environ[f"{library}_NUM_THREADS"] = "1"
     with answering_ctrl_c() as was_pressed:
         try:
             _prepare_environment()

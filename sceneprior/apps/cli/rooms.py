@@ -288,8 +288,6 @@ def view(
 
     check_can_serve(host, port)  # before seconds are spent on loading
     drawn = options.checked_shell(shell or "walls")
-    import torch
-
     from sceneprior.apps.api import load
     from sceneprior.apps.retrieval.cad_models import open_models
     from sceneprior.apps.sample import with_floor_of_file
@@ -297,8 +295,6 @@ def view(
     from sceneprior.apps.viewer.panel import open_page
     from sceneprior.render.scene_files import load_scene_folder
 
-    # One room at a time is too little work for several threads.
-    torch.set_num_threads(1)
     folder = Path(where)
     is_folder = folder.is_dir() and not (folder / "config.yaml").is_file()
     if asked and is_folder:

@@ -104,7 +104,9 @@ class Panel:
             return
         page = self.page
         number: Any = self._gui.add_slider("Room", min=1, max=count, step=1, initial_value=1)
-        number.on_update(lambda _: page.follow(lambda: page.show(folder.room(number.value - 1))))
+        number.on_update(
+            lambda _: page.follow(lambda: page.show(folder.room(value_of(number) - 1)))
+        )
 
     def _add_sampling(self, explorer: Explorer, asked: Mapping[str, Any]) -> None:
         gui, page = self._gui, self.page
@@ -118,7 +120,7 @@ class Panel:
             seed: Any = gui.add_number("Seed", 0, min=0, step=1)
 
             def sample() -> None:
-                self.sample(explorer, seed.value, None if origin is None else origin.value)
+                self.sample(explorer, seed.value, None if origin is None else value_of(origin))
 
             def another() -> None:
                 seed.value += 1  # the update triggers `sample`
@@ -173,9 +175,9 @@ class Panel:
                 page.show(explorer.step(0))
 
             def walk() -> None:
-                settled = step.value in (0, PATH_STEPS - 1)
                 if explorer.path is not None:
-                    page.show(explorer.step(step.value), settled)
+                    place = value_of(step)
+                    page.show(explorer.step(place), place in (0, PATH_STEPS - 1))
 
             step.on_update(lambda _: page.follow(walk))
             self._buttons({"Draw path": draw})
@@ -198,7 +200,7 @@ class Panel:
         page = self.page
 
         def chosen() -> None:
-            setattr(page.display, name, control.value)
+            setattr(page.display, name, value_of(control))
             page.show(page.shown)
 
         control.on_update(lambda _: page.safely(chosen))
@@ -209,9 +211,8 @@ class Panel:
             button = self._gui.add_button("Download")
 
             def send(client: Any) -> None:
-                name, content, notes = download(
-                    self.page.scene, form.value, self.page.display.shell
-                )
+                shown, shell = self.page.scene, self.page.display.shell
+                name, content, notes = download(shown, value_of(form), shell)
                 client.send_file_download(name, content, save_immediately=True)
                 if notes:
                     client.add_notification("Note", " ".join(notes), auto_close_seconds=20)
@@ -220,7 +221,18 @@ class Panel:
 
     def _buttons(self, tasks: dict[str, Callable[[], None]]) -> None:
         group = self._gui.add_button_group("", tuple(tasks))
-        group.on_click(lambda _: self.page.safely(tasks[group.value]))
+        group.on_click(lambda _: self.page.safely(lambda: tasks[value_of(group)]()))
+
+
+def value_of(control: Any) -> Any:
+    """The value of a control; a client may send any, and one that is not offered is an
+    InputError."""
+    value, most = control.value, getattr(control, "max", None)
+    known = (value,) if most is None else range(control.min, most + 1)
+    if value not in (known := getattr(control, "options", known)):
+        words = ", ".join(map(str, known)) if len(known) < 12 else f"{known[0]} to {known[-1]}"
+        raise InputError(f"'{str(value)[:40]}' is not offered here; choose from {words}.")
+    return value
 
 
 class RequestFields:

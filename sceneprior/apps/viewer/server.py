@@ -60,8 +60,8 @@ def serving(host: str, port: int) -> Iterator["viser.ViserServer"]:
             server.stop()
 
 
-def refusal(headers: "Headers", host: str) -> str | None:
-    """Reason to refuse an HTTP or WebSocket request to a page bound to `host`, else None.
+def refusal(headers: "Headers", host: str) -> tuple[int, str] | None:
+    """HTTP status and reason to refuse a request to a page bound to `host`, else None.
 
     Requests from the page itself, or from programs other than browsers, are accepted. The check
     uses two headers that a browser sets and no site can change. `Host` is the browser's name for
@@ -70,14 +70,19 @@ def refusal(headers: "Headers", host: str) -> str | None:
     (`ssh -L 9000:localhost:8080`) changes it.
     """
     hosts = headers.get_all("Host")
-    if len(hosts) != 1 or not is_own_name(urlsplit(f"//{hosts[0]}").hostname or "", host):
-        return (
+    try:
+        names = [urlsplit(f"//{name}").hostname or "" for name in hosts]
+        origins = [urlsplit(origin) for origin in headers.get_all("Origin")]
+    except ValueError as error:
+        return 400, f"The request's header Host or Origin names no place ({error}).\n"
+    if len(names) != 1 or not is_own_name(names[0], host):
+        return 403, (
             f"This page is not served under the name '{', '.join(hosts)}'. Open it at localhost or "
             "at an address of this machine, or start it with that name: sceneprior view --host "
             "NAME.\n"
         )
-    if any(urlsplit(origin).netloc != hosts[0] for origin in headers.get_all("Origin")):
-        return "This page does not answer other web sites.\n"
+    if any(each.scheme not in ("http", "https") or each.netloc != hosts[0] for each in origins):
+        return 403, "This page does not answer other web sites.\n"
     return None
 
 
@@ -126,9 +131,8 @@ def _checking_requests(host: str) -> Iterator[list[bool]]:
 
     def serve_checked(*args: Any, process_request: Any, **options: Any) -> Any:
         def check(connection: server.ServerConnection, request: Any) -> Any:
-            reason = refusal(request.headers, host)
-            if reason is not None:
-                return connection.respond(403, reason)
+            if (refused := refusal(request.headers, host)) is not None:
+                return connection.respond(*refused)
             return process_request(connection, request)
 
         checked.append(True)

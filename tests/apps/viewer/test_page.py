@@ -114,6 +114,33 @@ def test_a_request_is_answered_or_refused_in_the_panel(prior, tmp_path):
                 request.asked()
 
 
+@pytest.mark.parametrize("source", ["prior", "folder"])
+def test_values_that_the_page_does_not_offer_are_refused(prior, source, capfd):
+    """A client may send any value for any control."""
+    room = Explorer(prior) if source == "prior" else Folder([ROOM, ROOM])
+    with serving("127.0.0.1", 0) as server:
+        page = open_page(server, room, "mine").page
+        page.follow = page.safely
+        said = []
+        client = SimpleNamespace(add_notification=lambda *words, **_: said.append(words))
+        server.get_clients = lambda: {0: client}
+        tried = 0
+        for control in [*server.gui._gui_input_handle_from_uuid.values()]:
+            most = getattr(control, "max", None)
+            values = () if most is None else (control.min - 1, most + 1)
+            for value in ("glb", "") if hasattr(control, "options") else values:
+                control._impl.value = value
+                said.clear()
+                for answer in control._impl.update_cb:
+                    answer(SimpleNamespace(client=client))
+                tried += 1
+            if getattr(control, "label", None) == "Download":
+                for answer in control._impl.update_cb:
+                    answer(SimpleNamespace(client=client))
+                assert said[-1][1].startswith("'' is not offered here; choose from GLB, JSON")
+    assert tried > 5 and capfd.readouterr() == ("", "")
+
+
 class FakeScene:
     """Takes what is added, and keeps the names in order, and the newest handle of each."""
 

@@ -46,6 +46,12 @@ def test_its_own_page_is_answered_and_other_sites_are_not(port, more, answered):
     for host in (f"site.example:{port}", f"localhost.site.example:{port}", f"192.0.2.7:{port}", ""):
         assert status_of(port, ("Host", host), *more) == 403, host
         assert status_of(port, ("Host", host), ("Origin", f"http://{host}"), *more) == 403, host
+    for origin in (f"file://{own}", f"ftp://{own}", "file:///page.html", own, ""):
+        assert status_of(port, ("Host", own), ("Origin", origin), *more) == 403, origin
+    for broken in ("[::1", "[", "[x]", f"[{own}", "]"):
+        assert status_of(port, ("Host", broken), *more) in (400, 403), broken
+        origin = ("Origin", f"http://{broken}")
+        assert status_of(port, ("Host", own), origin, *more) in (400, 403), broken
     assert status_of(port, *more) == 403  # no host
     assert status_of(port, ("Host", own), ("Host", "site.example"), *more) == 403
 
