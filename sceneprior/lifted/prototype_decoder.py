@@ -37,6 +37,9 @@ from sceneprior.lifted.prototypes import (
 from sceneprior.lifted.shape_morphing import appearances_of, blend_parts, matched_parts
 from sceneprior.paper.decoders import ShapeModule, ShapeModuleConfig
 
+KEPT = 512
+"""Number of looks, and of matched pairs of looks, that are kept for later rooms: about 6 MB."""
+
 
 class PrototypeConfig(ShapeModuleConfig):
     """Shapes in parts, chosen among prototypes lifted from the training rooms' masks."""
@@ -242,11 +245,12 @@ class PrototypeDecoder(ShapeModule):
         size_m = _box_m(decoded, room, item)[3:]
         pair = look, int(decoded.next_looks[room, item])
         own = [self._posed(each) for each in pair]
-        if pair not in self._matched:
-            self._matched[pair] = matched_parts(*(each.parts for each in own))
+        if (matched := self._matched.get(pair)) is None:
+            matched = matched_parts(*(each.parts for each in own))
+            _keep(self._matched, pair, matched)
         here, there = (
             stretched_parts(parts, each.stretch, size_m)
-            for parts, each in zip(self._matched[pair], own, strict=True)
+            for parts, each in zip(matched, own, strict=True)
         )
         return blend_parts(here, there, share)
 
@@ -277,8 +281,8 @@ class PrototypeDecoder(ShapeModule):
         )
 
     def _posed(self, look: int) -> Posed:
-        """The shape of a look; computed once."""
-        if look not in self._shapes:
+        """The shape of a look, which is kept (`KEPT`)."""
+        if (shape := self._shapes.get(look)) is None:
             prototype, pose = divmod(look, POSES)
             parts = self.parts(prototype)
             surface = self._posed(look - pose).surface if pose else Mesh(*surface_of_parts(parts))
@@ -288,8 +292,9 @@ class PrototypeDecoder(ShapeModule):
             size_m = self.sizes_m[prototype].double().cpu().numpy()
             posed = _posed_parts(parts, pose)
             stretch = Stretch.of(posed, turned_extents(size_m[None], pose)[0])
-            self._shapes[look] = Posed(posed, Mesh(vertices, faces), stretch)
-        return self._shapes[look]
+            shape = Posed(posed, Mesh(vertices, faces), stretch)
+            _keep(self._shapes, look, shape)
+        return shape
 
     def looks(self, codes: Float[Tensor, "*objects codes"]) -> Int[Tensor, "*objects"]:
         """The look whose code is nearest, in a tie the first; 0 before prototypes are set."""
@@ -311,6 +316,12 @@ class PrototypeDecoder(ShapeModule):
     def known(self) -> list[int]:
         """Indices of the prototypes in use."""
         return (self.object_class != self.unknown).nonzero()[:, 0].tolist()
+
+
+def _keep(kept: dict[Any, Any], key: Any, value: Any) -> None:
+    if len(kept) >= KEPT:
+        kept.clear()
+    kept[key] = value
 
 
 def _box_m(decoded: DecodedScenes, room: int, item: int) -> Float[np.ndarray, "6"]:
