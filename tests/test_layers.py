@@ -46,11 +46,11 @@ BUDGET = {
     "sceneprior/render": (4490, 23),
     "sceneprior/training": (870, 5),
     "sceneprior/paper": (2405, 12),
-    "sceneprior/lifted": (7739, 38),
+    "sceneprior/lifted": (7750, 38),
     "sceneprior/baselines": (2909, 14),
     "sceneprior/evaluation": (4136, 20),
     "sceneprior/interchange": (892, 5),
-    "sceneprior/apps": (6213, 34),
+    "sceneprior/apps": (6231, 34),
 }
 """Most lines and modules of a folder. They go down freely, and up only in a commit that says what
 it bought and what went for it."""
