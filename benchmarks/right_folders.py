@@ -8,6 +8,7 @@ exact, the others have the noise of tracks.py. A folder is accused if `prep-pose
 """
 
 import argparse
+import re
 import shutil
 import sys
 import time
@@ -113,8 +114,10 @@ class Capture(PosedRoom):
         return self.images[view]
 
 
-def capture(views: RoomViews, names: tuple[str, ...], drawn: Draw, seed: int, room: Path) -> None:
-    """Write one room of shards as a user's capture."""
+def capture(
+    views: RoomViews, names: tuple[str, ...], drawn: Draw, seed: int, room: Path, scale: float
+) -> None:
+    """Write one room of shards as a user's capture; lengths come out `scale` times as long."""
     frames = shuffled(views, NOISES["noisy" if drawn.noisy else "clean"], seed)
     ids, class_of = frames.masks.ids, dict(enumerate(frames.masks.mask_class.tolist(), start=1))
     if drawn.tracked:
@@ -130,12 +133,13 @@ def capture(views: RoomViews, names: tuple[str, ...], drawn: Draw, seed: int, ro
     world[:2, 3] = rng.normal(size=2)
     poses = world @ Z_UP @ np.linalg.inv(frames.world_to_camera) @ OPENGL
     known = {"floor_m": 0.0} if drawn.floor else {}
+    known |= {"metres_per_unit": scale} if scale != 1 else {}
     focal = float(views.intrinsics[0, 0, 0])
     made = Capture(room, things, focal_px=focal, poses=list(poses), images=images)
     made.write(**known)
     POSES[drawn.poses](made)
     if drawn.poses == "colmap":
-        made.write_transforms({**known, "metres_per_unit": 1 / SCALE})
+        made.write_transforms({**known, "metres_per_unit": scale / SCALE})
     elif drawn.poses != "nerfstudio":
         made.write_transforms(known)
     (TRACKED if drawn.tracked else UNTRACKED)[drawn.masks](made)
@@ -165,10 +169,13 @@ def _tracked(
     return tracked, classes
 
 
-def make_shards(drawn: Draw, seed: int, homes: Path, out: Path) -> None:
-    """Shards of a folder of captures, as `prep-posed` makes them."""
-    shutil.rmtree(out, ignore_errors=True)
-    houses, front, captures = out / "houses", out / "front", out / "captures"
+def drawn_rooms(drawn: Draw, seed: int, homes: Path, out: Path) -> Path:
+    """Shards of made rooms, which stay in `out`."""
+    front = out / "front"
+    if (front / "index.json").is_file():
+        return front
+    houses = out / "houses"
+    shutil.rmtree(houses, ignore_errors=True)
     houses.mkdir(parents=True)
     first = seed % HOMES_FOR * MOST_ROOMS
     for path in sorted((homes / "3D-FRONT").iterdir())[first : first + drawn.rooms]:
@@ -178,22 +185,33 @@ def make_shards(drawn: Draw, seed: int, homes: Path, out: Path) -> None:
         f"views.image_size={[*drawn.size]}", f"views.fov_deg={drawn.fov_deg}",
         "views.min_object_pixels=20",
     )  # fmt: skip
-    recipe = load_recipe(drawn.kind, rules)
-    source = FrontSource(houses, homes / "3D-FUTURE-model", recipe)
+    source = FrontSource(houses, homes / "3D-FUTURE-model", load_recipe(drawn.kind, rules))
     build_shards(Job(source, front, renderer="software"))
-    names = label_set(read_index(front)["label_set"])
+    shutil.rmtree(houses)
+    return front
+
+
+def make_shards(drawn: Draw, seed: int, homes: Path, out: Path, scale: float) -> Path:
+    """Shards of a folder of captures, as `prep-posed` makes them."""
+    shards = out / f"shards_{scale:g}"
+    if (shards / "index.json").is_file():
+        return shards
+    front, captures = drawn_rooms(drawn, seed, homes, out), out / "captures"
+    for folder in (captures, shards):
+        shutil.rmtree(folder, ignore_errors=True)
+    label_set_name = read_index(front)["label_set"]
     rooms = [
         shard.read_room(room_id, images=True)
         for split in ("train", "val", "test") if any((front / split).glob("*.h5"))
         for shard, room_id in iterate_rooms(front, split)
     ]  # fmt: skip
     for place, views in enumerate(rooms[: drawn.rooms]):
-        capture(views, names, drawn, 100 * seed + place, captures / f"room{place}")
+        room = captures / f"room{place}"
+        capture(views, label_set(label_set_name), drawn, 100 * seed + place, room, scale)
     tracks = "auto" if drawn.auto else "given"
-    reader = Posed(captures, classes=recipe.label_set, tracks=tracks)
-    build_shards(Job(reader, out / "shards"))
-    for folder in (houses, front, captures):
-        shutil.rmtree(folder)
+    build_shards(Job(Posed(captures, classes=label_set_name, tracks=tracks), shards))
+    shutil.rmtree(captures)
+    return shards
 
 
 class Verdict(NamedTuple):
@@ -205,46 +223,61 @@ class Verdict(NamedTuple):
     """Mean agreement of masks and cameras."""
     checked: bool = False
     """Some mistakes are excluded: the verdict is more than that little could be checked."""
+    sized: bool = False
+    """The scale could be checked."""
+
+    @property
+    def suggested(self) -> float | None:
+        """The factor that the first sentence gives."""
+        found = re.search(r"--metres-per-unit ([\d.]+(?:e-\d+)?)", " ".join(self.problems[:1]))
+        return float(found[1]) if found else None
 
 
-def verdict(drawn: Draw, seed: int, out: Path) -> Verdict:
+def verdict(drawn: Draw, seed: int, out: Path, scale: float) -> Verdict:
     """Make the folder, unless it is there, and verify it."""
+    block = seed // HOMES_FOR
+    homes = out.parent / f"{drawn.kind}_{block}"
     try:
-        if not (out / "shards" / "index.json").is_file():
-            block = seed // HOMES_FOR
-            homes = out.parent / f"{drawn.kind}_{block}"
-            if not homes.is_dir():
-                make_homes(homes, 2 * HOMES_FOR * MOST_ROOMS, drawn.kind, seed=1000 + block)
-            make_shards(drawn, seed, homes, out)
-        found = verify(out / "shards")
+        if not homes.is_dir():
+            make_homes(homes, 2 * HOMES_FOR * MOST_ROOMS, drawn.kind, seed=1000 + block)
+        found = verify(make_shards(drawn, seed, homes, out, scale))
     except InputError as error:
         return Verdict((f"refused: {error}",))
     evidence = evidence_of(found.every)
     assert evidence is not None, "rooms with sound arrays have evidence"
-    return Verdict(found.problems, evidence.share(GIVEN), bool(what_was_checked(evidence)[0]))
+    checked = bool(what_was_checked(evidence)[0])
+    return Verdict(found.problems, evidence.share(GIVEN), checked, evidence.scale is not None)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("out", type=Path)
     parser.add_argument("--seeds", type=int, nargs=2, default=(0, 100), metavar=("FIRST", "END"))
+    parser.add_argument("--scale", type=float, default=1.0, help="a mistake: of all lengths")
     options = parser.parse_args()
     verdicts: list[Verdict] = []
+    factors: list[float] = []
     of: dict[str, Counter[bool]] = {}
     start = time.process_time()
     for seed in range(*options.seeds):
         drawn = draw(seed)
-        verdicts.append(found := verdict(drawn, seed, options.out / f"{seed:03d}"))
+        verdicts.append(found := verdict(drawn, seed, options.out / f"{seed:03d}", options.scale))
         tracks = "untracked" if drawn.auto or not drawn.tracked else "tracked"
         noise = "noisy" if drawn.noisy else "exact"
         for group in (drawn.kind, drawn.poses, drawn.masks, tracks, noise):
             of.setdefault(group, Counter())[bool(found.problems)] += 1
         said = f"ACCUSED: {' | '.join(found.problems)}" if found.problems else "-"
-        print(seed, *drawn, f"{found.fit:.2f}", found.checked, said, flush=True)
-    accused, checked = (sum(map(bool, column)) for column in (
-        [found.problems for found in verdicts], [found.checked for found in verdicts]
+        print(seed, *drawn, f"{found.fit:.2f}", found.checked, found.sized, said, flush=True)
+        factors += [factor * options.scale] if (factor := found.suggested) else []
+    accused, checked, sized = (sum(map(bool, column)) for column in (
+        [found.problems for found in verdicts], [found.checked for found in verdicts],
+        [found.sized for found in verdicts],
     ))  # fmt: skip
     print(f"{accused} of {len(verdicts)} folders accused; in {checked} some mistakes are excluded")
+    print(f"the scale could be checked in {sized}; {len(factors)} are told a metres_per_unit")
+    if factors:
+        off = np.exp(np.percentile(np.abs(np.log(factors)), [50, 90, 100]))
+        print("off by a factor of {:.2f} in the median, {:.2f} (90%), {:.2f} at most".format(*off))
     print(f"least fit {min(found.fit for found in verdicts):.2f}")
     print("; ".join(f"{name} {counts[True]} of {counts.total()}" for name, counts in of.items()))
     print(f"{time.process_time() - start:.0f} CPU s")

@@ -216,7 +216,7 @@ def prep_posed(
         typer.echo(f"Found {sentence}", err=True)
     for sentence in source.assumptions():
         typer.echo(f"Note: {sentence}", err=True)
-    run_job(source, out, workers)
+    run_job(source, out, workers, verified=True)
 
 
 def prep_dataset(
@@ -320,9 +320,11 @@ def _verify(shards: Path, room: str | None, workers: int) -> None:
     typer.echo(f"{shards}: {summary(found)}")
 
 
-def run_job(source: "Source", out: Path, workers: int | None, **options: Any) -> None:
+def run_job(
+    source: "Source", out: Path, workers: int | None, verified: bool = False, **options: Any
+) -> None:
     """Build shards and print the report, for every `prep-*` command; `options` are those of
-    `Job`."""
+    `Job`. If `verified`, the verdict of `inspect --verify` follows."""
     from rich.console import Console
 
     from data_prep.engine.build import Job, build_shards
@@ -340,6 +342,11 @@ def run_job(source: "Source", out: Path, workers: int | None, **options: Any) ->
         made += f", {summary.shards_open} still to make: run without --only"
     drawn = f"; {summary.renderer}" if summary.renderer else ""
     typer.echo(f"{out}: {summary} ({made}{drawn})")
+    if verified and not summary.shards_open:
+        from data_prep.inspection.tables import verdict
+        from data_prep.inspection.verify import verify
+
+        typer.echo(f"Note: {verdict(verify(out, workers=workers or 1))}", err=True)
     if source.only is None and not summary.counts["test"]["rooms"]:
         typer.echo(
             "Note: the 'test' split is empty. `fit` and `synthesize` do not need it, but eval-fid "

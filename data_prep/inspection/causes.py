@@ -311,6 +311,11 @@ SENTENCES: dict[str, Callable[[Any, Convention], str]] = {
         f"the width and {shift[1]:+.0%} of the height must be added; were the pictures cropped "
         "after calibration?"
     ),
+    "scale": lambda scale, convention: (
+        f"{scale}: pass --metres-per-unit {1 / scale.factor:.2g}, or multiply the one given by this"
+        if convention.posed
+        else f"{scale}: are the translations of the cameras in metres?"
+    ),
     "unit": lambda factor, convention: (
         "the translations of the cameras seem to have another unit than the objects"
     ),

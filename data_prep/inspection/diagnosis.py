@@ -46,11 +46,10 @@ _GAIN = 1.3
 """Minimum ratio of the agreement of objects found without ids to that of the given ids."""
 _NEARNESS = 0.1
 """Mean correlation below which poses belong to other frames; correct rooms have 0.1 to 0.7."""
-_EYES_M, _LENGTHS_M = (0.2, 4.0), (0.15, 6.0)
-"""Plausible ranges of the median camera height and of the median length of objects."""
-_SOME_LENGTHS = 3
-"""Minimum number of objects for testing lengths: a single object may be badly visible."""
-_UNITS_M = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254, "feet": 0.3048}
+_EYES_M = 0.2, 4.0
+"""Plausible range of the median camera height."""
+_SAME_SCALE = 0.4
+"""Step of the logarithm of a wrong scale within which rooms have the same mistake."""
 _FLOOR_M = 0.15
 _ONCE, _SOME_IDS = 0.8, 8
 """Share of ids that occur in a single view above which ids are not tracked, and the minimum number
@@ -120,7 +119,7 @@ def _tracked_better(rooms: Iterable[RoomViews]) -> str:
                 array[None].astype(np.float64)
                 for array in (views.world_to_camera, views.intrinsics)
             )
-            sums[row] += float(fit(seen, poses, lenses)[0].sum()), len(seen.item)
+            sums[row] += float(fit(seen, poses, lenses).sum()), len(seen.item)
     (given, of_given), (found, of_found) = sums.tolist()
     # With right poses and wrong ids, most masks join others; with wrong poses, hardly any do.
     if found > _GOOD * of_found and found > _GAIN * given and 2 * found > of_given:
@@ -169,7 +168,7 @@ def _unexplained(evidence: Evidence, convention: Convention) -> Finding:
 
 
 def _implausible(evidence: Evidence, convention: Convention) -> Finding | None:
-    """Find an unusual direction, height or length, which masks alone do not determine."""
+    """Find an unusual direction, size or height, which masks alone do not determine."""
     axis = int(np.abs(evidence.tops).argmax())
     if abs(evidence.tops[axis]) > 0.5 and evidence.tops[1] <= 0.5:
         along = np.sign(evidence.tops[axis]) * convention.room_from_world[axis, :3]
@@ -182,21 +181,18 @@ def _implausible(evidence: Evidence, convention: Convention) -> Finding | None:
             f"the tops of the pictures point {where} of {convention.file}, which is not the axis "
             f"that was taken as up: {cure}",
         )
-    length_m = evidence.length_m if evidence.measured >= _SOME_LENGTHS else None
-    for what, value, (low, high) in (
-        ("the cameras stand {:.3g} m above the floor", evidence.eye_m, _EYES_M),
-        ("the objects are {:.3g} m long", length_m, _LENGTHS_M),
-    ):
-        if value is not None and not low <= value <= high:
-            unit = _likely_unit(evidence) if convention.posed else None
-            cure = "are the poses in metres, and is the floor at the right height?"
-            if unit is not None:
-                cure = (
-                    f"the poses seem to be in {unit}: pass --metres-per-unit {_UNITS_M[unit]:g} "
-                    "(or write metres_per_unit)"
-                )
-            size = f"{what.format(value)} in the median, expected {low:g} to {high:g} m"
-            return Finding(("unit", unit), f"{size}: {cure}")
+    if (scale := evidence.scale) is not None and scale.is_wrong:
+        key = "scale", round(np.log(scale.factor) / _SAME_SCALE)
+        return Finding(key, sentence_of(Cause("scale", scale), convention))
+    low, high = _EYES_M
+    if not low <= evidence.eye_m <= high:
+        unit = " (--metres-per-unit)" * convention.posed
+        return Finding(
+            "unit",
+            f"the cameras stand {evidence.eye_m:.3g} m above the floor in the median, expected "
+            f"{low:g} to {high:g} m: are the poses in metres{unit}, and is the floor at the right "
+            "height?",
+        )
     if evidence.floor_m is not None and abs(evidence.floor_m) > _FLOOR_M:
         side = "above" if evidence.floor_m > 0 else "below"
         cure = "is the floor at y = 0?"
@@ -205,15 +201,6 @@ def _implausible(evidence: Evidence, convention: Convention) -> Finding | None:
         off = f"{abs(evidence.floor_m):.2f} m {side} the floor"
         return Finding("floor", f"the lowest objects end {off}: {cure}")
     return None
-
-
-def _likely_unit(evidence: Evidence) -> str | None:
-    """Unit of the poses in which furniture is about 0.9 m long; None if no unit is plausible."""
-    if evidence.length_m is None:
-        return None
-    lengths = {name: evidence.length_m * factor for name, factor in _UNITS_M.items()}
-    best = min(lengths, key=lambda name: abs(np.log(lengths[name] / 0.9)))
-    return best if 0.4 < lengths[best] < 2 else None
 
 
 def what_was_checked(evidence: Evidence) -> tuple[list[str], list[str]]:

@@ -5,6 +5,7 @@ nothing cuts the box off along that axis. With the right cameras, these points e
 front of the cameras. Many hypotheses about the cameras are compared at once.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +13,8 @@ from scipy.stats import rankdata
 
 from data_prep.inspection.agreement import NEAR_M, Room
 from data_prep.inspection.causes import Cause, Convention, corrections
-from data_prep.readers.upright import find_floor, own_sides
+from data_prep.inspection.scale import LogSize, Scale, estimate_scale, floor_and_sizes
+from data_prep.readers.upright import own_sides
 from sceneprior.core.cameras import camera_centers
 from sceneprior.core.observations import RoomViews
 
@@ -27,8 +29,6 @@ _ROUNDS = 6
 _LEAST_VIEWS = 5
 """Minimum number of views for comparing the order of frames."""
 _SAME_FLOOR_M = 0.1
-_PIECES = 3
-"""Minimum number of pieces that determine a room's floor: two lamps may hang at the same height."""
 
 
 class Evidence(NamedTuple):
@@ -52,15 +52,15 @@ class Evidence(NamedTuple):
     """Mean direction of the tops of the pictures in the room frame; y should be up."""
     eye_m: float
     """Median height of the cameras."""
-    length_m: float | None
-    """Median length of the objects; None without any."""
     floor_m: float | None
     """Height of the bottoms of the lowest objects (`find_floor`); None if few of them agree."""
+    sizes: tuple[LogSize, ...] = ()
+    """Sizes of objects of known classes."""
 
     @property
-    def measured(self) -> int:
-        """Number of objects whose lengths are known; each takes three middles."""
-        return (self.middles - self.spare) // 3
+    def scale(self) -> Scale | None:
+        """Scale by the sizes; None if few are known."""
+        return estimate_scale(self.sizes)
 
     def share(self, cause: Cause) -> float:
         """Mean agreement in [0, 1] after a correction."""
@@ -75,19 +75,19 @@ class Evidence(NamedTuple):
         )
 
 
-def room_evidence(views: RoomViews, convention: Convention, floor: bool) -> Evidence:
-    """Compare the masks of one room, read with images, with its cameras as they are and corrected.
+def room_evidence(
+    views: RoomViews, convention: Convention, names: Sequence[str] | None
+) -> Evidence:
+    """Compare the masks of one room with its cameras as they are and corrected.
 
-    `floor` also estimates the height of the floor, which takes longer than everything else.
+    The height of the floor and the sizes of objects, whose classes are of the list `names`, are
+    left out if it is None: they take longer than everything else.
     """
     found, rooms = middles(views), corrections(Room(views), convention)
     poses = np.stack([room.views.world_to_camera for room in rooms.values()])
     lenses = np.stack([room.views.intrinsics for room in rooms.values()])
-    agreement, depth = fit(found, poses, lenses)
-    sizes_m = found.extent_px * depth[0] / lenses[0][found.view, found.axis, found.axis]
-    lengths = [sizes_m[found.item == k].max() for k in np.unique(found.item)]
-    lengths = [length for length in lengths if length > 0]
-    level = find_floor(views, poses[0], lenses[0]) if floor else None
+    agreement = fit(found, poses, lenses)
+    floor_m, sizes = (None, ()) if names is None else floor_and_sizes(views, names)
     shown = views.visible.sum(axis=0)
     x, y, z = (-poses[0, :, 1, :3]).mean(axis=0).tolist()
     return Evidence(
@@ -102,8 +102,8 @@ def room_evidence(views: RoomViews, convention: Convention, floor: bool) -> Evid
         nearness=_nearness(views),
         tops=(x, y, z),
         eye_m=float(np.median(camera_centers(poses[0])[:, 1])),
-        length_m=float(np.median(lengths)) if lengths else None,
-        floor_m=None if level is None or level[1] < _PIECES else level[0],
+        floor_m=floor_m,
+        sizes=sizes,
     )
 
 
@@ -119,7 +119,7 @@ def total(rooms: list[Evidence]) -> Evidence:
     causes = {cause: None for room in rooms for cause in room.sums}
     counts = ("rooms", "middles", "spare", "views", "ids", "masks", "once")
     x, y, z = np.mean([room.tops for room in rooms], axis=0).tolist()
-    nearness, lengths, floors = known("nearness"), known("length_m"), known("floor_m")
+    nearness, floors = known("nearness"), known("floor_m")
     level = float(np.median(floors)) if floors else 0.0
     same = sum(abs(floor - level) < _SAME_FLOOR_M for floor in floors)
     agreed = same >= min(len(rooms), 2) and 3 * same >= 2 * len(floors)
@@ -129,8 +129,8 @@ def total(rooms: list[Evidence]) -> Evidence:
         nearness=float(np.mean(nearness)) if nearness else None,
         tops=(x, y, z),
         eye_m=float(np.median(known("eye_m"))),
-        length_m=float(np.median(lengths)) if lengths else None,
         floor_m=level if floors and agreed else None,
+        sizes=tuple(size for room in rooms for size in room.sizes),
     )
 
 
@@ -161,8 +161,6 @@ class Middles(NamedTuple):
     """(m,) 0 for u, 1 for v."""
     place_px: np.ndarray
     """(m,)"""
-    extent_px: np.ndarray
-    """(m,) size of the 2D box along this axis."""
     slack_px: np.ndarray
     """(m,) distance at which the agreement is one half."""
 
@@ -187,13 +185,11 @@ def middles(views: RoomViews) -> Middles:
     low, high = boxes[view, item, axis], boxes[view, item, axis + 2]
     slack = TOLERANCE * max(views.image_size) + OF_BOX * (high - low)
     number = np.unique(item, return_inverse=True)[1]
-    return Middles(view, number, axis, (low + high) / 2, high - low, slack)
+    return Middles(view, number, axis, (low + high) / 2, slack)
 
 
-def fit(
-    found: Middles, world_to_camera: np.ndarray, intrinsics: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Agreement of each middle with each of h hypotheses about the cameras, and its depth.
+def fit(found: Middles, world_to_camera: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    """Agreement of each middle with each of h hypotheses about the cameras, (h, m) in [0, 1].
 
     The agreement is 1 / (1 + (r / slack)^2) for the distance r in pixels from the middle to the
     object's projected point, which is a robust least-squares solution. r is divided by one minus
@@ -203,14 +199,9 @@ def fit(
     Args:
         world_to_camera: (h, T, 4, 4), OpenCV axes; the world frame and its unit are arbitrary.
         intrinsics: (h, T, 3, 3)
-
-    Returns:
-        The agreement in [0, 1], (h, m), and the depth of each middle's object point, (h, m), in the
-        unit of the poses.
     """
     if not len(found.item):
-        none = np.zeros((len(world_to_camera), 0))
-        return none, none
+        return np.zeros((len(world_to_camera), 0))
     rows = np.arange(len(found.item))
     starts = np.flatnonzero(np.diff(found.item, prepend=-1))
     # Poses are moved and scaled: cameras then stand about 2 m from the origin, their middle.
@@ -244,5 +235,4 @@ def fit(
     inverse, weighted = np.linalg.inv(square)[:, found.item], weighted[..., :3]
     leverage = np.einsum("hmi,hmij,hmj->hm", weighted, inverse, weighted)
     off = off / np.maximum(1 - leverage, 1e-3)
-    agreement = np.where(depth > NEAR_M, 1 / (1 + (off / found.slack_px) ** 2), 0.0)
-    return agreement, depth * unit[:, None]
+    return np.where(depth > NEAR_M, 1 / (1 + (off / found.slack_px) ** 2), 0.0)

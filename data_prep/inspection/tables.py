@@ -121,34 +121,51 @@ def check_tables(found: FolderCheck) -> list[Table]:
     return tables
 
 
+def verdict(found: FolderCheck) -> str:
+    """First problem of a folder; or else a sentence that names what could not be checked."""
+    if found.problems:
+        more = len(found.problems) - 1
+        return found.problems[0] + f" ({more} more: run inspect --verify)" * bool(more)
+    evidence = evidence_of(found.every)
+    assert evidence is not None, "a folder without problems has evidence"
+    tallies = agreement_of(found.every)
+    in_3d = any(tally.whole for tally in tallies.values())
+    unchecked = [] if in_3d else what_was_checked(evidence)[1]
+    if not tallies:
+        if evidence.scale is None:
+            sized = sum(bool(size.name) for size in evidence.sizes)
+            unchecked.append(f"the scale ({sized} objects of known size)")
+        elif alone := sum(room.evidence and not room.evidence.scale for room in found.every):
+            unchecked.append(f"the scale of {alone} rooms, each for itself (too few objects)")
+        unchecked += ["the height of the floor"] * (evidence.floor_m is None)
+        unchecked.append("whether all pictures are mirror images")
+    left = f"nothing wrong is found, but these could not be checked: {', '.join(unchecked)}."
+    return left if unchecked else "all is well."
+
+
 def summary(found: FolderCheck) -> str:
     """State which checks a folder without problems has passed, and which were not possible."""
     evidence = evidence_of(found.every)
     assert evidence is not None, "a folder without problems has evidence"
-    yes, no = what_was_checked(evidence)
-    tallies = agreement_of(found.every)
-    begin = "all is well" if yes or tallies else "nothing wrong is found, but little is checked"
-    parts = [f"{begin}. Checksums, shapes, ranges, 2D boxes and masks agree"]
+    yes, scale = what_was_checked(evidence)[0], evidence.scale
+    parts = [f"{verdict(found)} Checksums, shapes, ranges, 2D boxes and masks agree"]
     if without := sum(not check.has_checksum for check in found.every):
         parts.append(f"{without} rooms carry no checksum (shards of an earlier release)")
-    for kind, tally in tallies.items():
+    for kind, tally in agreement_of(found.every).items():
         text = f"{tally.share:.1%} of {tally.masks} masks lie within their projected {KINDS[kind]}"
         if tally.whole:
             text += f"; {tally.whole} unoccluded ones have a mean 2D IoU of {tally.mean_iou:.3f}"
         parts.append(text)
     parts.append(evidence.counts)
-    fit = (
-        f"masks and cameras agree by {evidence.share(GIVEN):.2f} of 1 (shuffled cameras: "
-        f"{evidence.share(CHANCE):.2f})"
-    )
     if yes:
-        parts.append(f"{fit}, which excludes {', '.join(yes)}")
-    if no:
-        few = f" ({evidence.spare} measurements to spare; too few views show whole objects)"
-        parts.append(f"not excluded: {', '.join(no)}{few * (not yes)}")
-    if not tallies:
-        floor = ", the height of the floor" * (evidence.floor_m is None)
         parts.append(
-            f"not checked: the exact scale{floor}, and whether all pictures are mirror images"
+            f"masks and cameras agree by {evidence.share(GIVEN):.2f} of 1 (shuffled cameras: "
+            f"{evidence.share(CHANCE):.2f}), which excludes {', '.join(yes)}"
+        )
+    else:
+        parts.append(f"{evidence.spare} measurements to spare; too few views show whole objects")
+    if scale is not None:
+        parts.append(
+            f"{scale}, which excludes lengths {scale.bound:.2g} times too long or too short"
         )
     return "; ".join(parts) + "."

@@ -257,7 +257,7 @@ def _check_room(shard: Shard, folder: Path, check: RoomCheck) -> RoomCheck:
         return replace(check, problems=(str(error).removesuffix("."),))
     changed = "its checksum does not match its contents: the file was changed or damaged"
     problems = [changed] * (stored is not None and stored != room_checksum(views, truth))
-    wrong = [*array_problems(views, len(label_set(shard.label_set)))]
+    wrong = [*array_problems(views, len(names := label_set(shard.label_set)))]
     of_truth = [] if truth is None else [*truth_problems(views, truth)]
     problems += [*wrong, *mask_problems(views), *of_truth]
     check = replace(
@@ -266,7 +266,8 @@ def _check_room(shard: Shard, folder: Path, check: RoomCheck) -> RoomCheck:
     )  # fmt: skip
     if wrong or of_truth:
         return check
-    check = replace(check, evidence=room_evidence(views, check.convention, truth is None))
+    known = None if truth else names
+    check = replace(check, evidence=room_evidence(views, check.convention, known))
     if truth is None:
         return check
     bodies, found = true_bodies(views, truth, folder)

@@ -11,7 +11,7 @@ from data_prep.engine.source import Line, PreparedRoom, RoomTask
 from data_prep.readers.corrected import correct
 from data_prep.readers.frames import room_cameras
 from data_prep.readers.heading import find_turn, note_of_turn, turn_matrix
-from data_prep.readers.upright import find_floor
+from data_prep.readers.upright import find_floor, fit_upright
 from sceneprior.core.boxes import CUBE_CORNERS
 from sceneprior.core.cameras import to_camera, to_pixels
 from sceneprior.core.classes import VOID, label_set
@@ -215,7 +215,9 @@ def _floor(
     elif floor_y is None and room.assumed_camera_m is None:
         raise InputError(f"{room.where}: no visible object has a 3D box, so the floor is unknown.")
     elif floor_y is None:
-        found = find_floor(seen, room_cameras(room.camera_to_world), room.intrinsics)
+        size = seen.instance_ids.shape[1:]
+        boxes_found = fit_upright(seen, size, room_cameras(room.camera_to_world), room.intrinsics)
+        found = find_floor(seen, size, *boxes_found)
         if found is not None and found[0] < lowest:
             floor_y, pieces = found
             under = f"{lowest - floor_y:.2f} m below the lowest camera"

@@ -9,7 +9,7 @@ import numpy as np
 
 from sceneprior.core.boxes import CUBE_CORNERS
 from sceneprior.core.cameras import camera_centers, nearest_to_rays, pixel_rays
-from sceneprior.core.observations import Observations, RoomViews, Sightings
+from sceneprior.core.observations import Sightings
 
 VIEWS_AT_MOST = 10
 """Maximum number of views used per object; more only take longer."""
@@ -94,18 +94,15 @@ def fit_upright(
 
 
 def find_floor(
-    seen: Observations | RoomViews, world_to_camera: np.ndarray, intrinsics: np.ndarray
+    seen: Sightings, image_size: tuple[int, int], corners: np.ndarray, misfit_px: np.ndarray
 ) -> tuple[float, int] | None:
     """Find the height at which the lowest pieces end, along y, and the number of these pieces.
 
-    An upright box is fitted to each piece; the floor is at the bottom of the lowest boxes. The
-    cameras' world is in metres, and its y points up. None if fewer than two pieces agree.
+    The floor is at the bottom of the lowest boxes, which are those of `fit_upright`. None if fewer
+    than two pieces agree.
     """
-    assert seen.instance_ids is not None, "read with images"
-    height, width = seen.instance_ids.shape[1:]
-    corners, misfit_px = fit_upright(seen, (height, width), world_to_camera, intrinsics)
-    believed = misfit_px < _MISFIT_SHARE * max(width, height)
-    believed &= own_sides(seen, (height, width))[..., 3].sum(axis=0) >= _LOWER_SIDES
+    believed = misfit_px < _MISFIT_SHARE * max(image_size)
+    believed &= own_sides(seen, image_size)[..., 3].sum(axis=0) >= _LOWER_SIDES
     ends = corners[believed, :, 1].min(axis=1).tolist()
     for end in sorted(ends):
         same = [other for other in ends if 0 <= other - end <= _AGREE_M]

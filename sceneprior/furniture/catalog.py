@@ -1,6 +1,7 @@
 """Makes the furniture catalogue: a dozen models per class, with realistic sizes."""
 
 import csv
+import re
 import uuid
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -36,6 +37,13 @@ Percentiles = tuple[tuple[float, ...], ...]
 SIZES_OF_OURS: dict[str, Percentiles] = {
     "dressing_chair": ((0.50, 0.53, 0.62), (0.53, 0.68, 0.85), (0.50, 0.575, 0.64))
 }
+
+_SYNONYMS = {
+    "bedside_table": "nightstand", "night_stand": "nightstand", "bookcase": "bookshelf",
+    "shelves": "shelf", "couch": "sofa", "fridge": "refrigerator", "refridgerator": "refrigerator",
+}  # fmt: skip
+_GENERAL = ("bed", "chair", "desk", "sofa", "table")
+"""Classes whose names, at the end of a longer name, stand for the object itself."""
 
 _LOUNGE_CHAIR = "Lounge Chair / Cafe Chair / Office Chair"
 
@@ -157,9 +165,17 @@ def _sizes(name: str, rng: np.random.Generator) -> list[Vector]:
     return list(zip(*sides, strict=True))
 
 
+def real_size(name: str) -> Percentiles | None:
+    """Percentiles of the sizes of a class, by any of its usual names; None if they are unknown."""
+    whole = "_".join(re.findall("[a-z]+", name.lower()))
+    last = whole.rpartition("_")[2]
+    sizes = real_sizes()
+    return sizes.get(_SYNONYMS.get(whole, whole)) or (sizes[last] if last in _GENERAL else None)
+
+
 @lru_cache(maxsize=1)
 def real_sizes() -> dict[str, Percentiles]:
-    """Percentiles of the sizes of every class."""
+    """Percentiles of the sizes of every class; those of 0 models are usual sizes of products."""
     text = files("sceneprior.furniture").joinpath("furniture_sizes.csv").read_text()
     sizes: dict[str, Percentiles] = {}
     for row in csv.DictReader(text.splitlines()):

@@ -5,6 +5,7 @@ tests/golden/data_prep/mistakes.json.
 """
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from PIL import Image
 
 from data_prep.engine.build import Job, build_shards
 from data_prep.inspection.diagnosis import find_mistake
-from data_prep.inspection.tables import summary
+from data_prep.inspection.tables import summary, verdict
 from data_prep.inspection.verify import evidence_of, read_conventions, verify
 from data_prep.readers.posed.reader import Posed
 from sceneprior.core.classes import label_set
@@ -100,9 +101,9 @@ def of_ids(change):
     return changes
 
 
-def shards_of(folder: Path, out: Path) -> Path:
+def shards_of(folder: Path, out: Path, **settings) -> Path:
     """Shards of captures."""
-    build_shards(Job(Posed(folder, classes="front3d_bedroom"), out))
+    build_shards(Job(Posed(folder, classes="front3d_bedroom", **settings), out))
     return out
 
 
@@ -191,7 +192,6 @@ MISTAKES = {
     "shuffled": of_poses(_shuffled),
     "y up": of_poses(lambda poses: np.linalg.inv(Z_UP) @ poses),
     "centimetres": of_poses(_scaled(100)),
-    "feet": of_poses(_scaled(1 / 0.3048)),
     **{f"focal length {factor}": _longer(factor) for factor in (0.5, 0.7, 1.3, 1.5, 2)},
     "principal point in the corner": of_keys(cx=lambda data: 0.0, cy=lambda data: 0.0),
     "intrinsics of another size": of_keys(
@@ -234,7 +234,33 @@ def test_the_first_cause_named_is_the_mistake(captures, name, tmp_path):
 def test_few_pieces_tell_neither_floor_nor_unit(tmp_path, rooms, seed, views_per_m2):
     """Two lamps that hang at one height, and a room with a single piece, badly seen."""
     make_captures(tmp_path / "captures", rooms, seed, views_per_m2)
-    assert verify(shards_of(tmp_path / "captures", tmp_path / "shards")).problems == ()
+    found = verify(shards_of(tmp_path / "captures", tmp_path / "shards"))
+    assert found.problems == ()
+    assert ("the scale (" in verdict(found)) == (evidence_of(found.every).scale is None)
+
+
+@pytest.mark.parametrize(
+    "scale", [0.3, *(pytest.param(scale, marks=pytest.mark.slow) for scale in (0.1, 0.5, 2, 3.3))]
+)
+def test_sizes_of_known_classes_tell_the_unit(captures, tmp_path, scale):
+    """The sentence gives about the factor that undoes a wrong `metres_per_unit`."""
+    (said, *more) = verify(shards_of(captures, tmp_path / "shards", metres_per_unit=scale)).problems
+    told = float(re.search(r"pass --metres-per-unit ([\d.]+),", said)[1])
+    assert abs(np.log(told * scale)) < np.log(1.25) and not more
+    assert "pendant_lamp" in said  # the classes that were compared
+
+
+def test_names_that_are_no_classes_of_known_size_leave_the_scale_unchecked(captures, tmp_path):
+    def unknown(room, data):
+        table = json.loads((room / "classes.json").read_text())
+        (room / "classes.json").write_text(json.dumps(dict.fromkeys(table, "thing")))
+
+    folder = changed(captures, tmp_path / "unknown", unknown)
+    out = tmp_path / "shards"
+    build_shards(Job(Posed(folder, classes="void,thing"), out))
+    found = verify(out)
+    assert found.problems == ()
+    assert "could not be checked" in verdict(found) and "(0 objects of known" in verdict(found)
 
 
 def test_right_captures_pass_and_a_floor_at_the_wrong_height_is_named(captures, tmp_path):
