@@ -65,16 +65,15 @@ class Sightings(NamedTuple):
         # Clipped as a safeguard: compiled code checks no index.
         boxes_px = np.rint(np.nan_to_num(boxes) * size).clip(0, size).astype(np.int64)
         boxes_px[:, 2:] = np.maximum(boxes_px[:, 2:], boxes_px[:, :2])
-        tables = [np.zeros(0, np.int32)]
-        for image, (x1, y1, x2, y2) in zip(ids, boxes_px, strict=True):
-            own = (image[y1:y2, x1:x2] == item + 1).cumsum(0, np.int32).cumsum(1, np.int32)
-            tables.append(np.pad(own, ((1, 0), (1, 0))).ravel())
-        starts = np.cumsum([len(table) for table in tables])[:-1]
+        sizes = np.prod(boxes_px[:, 2:] - boxes_px[:, :2] + 1, axis=1)
+        starts, tables = np.cumsum(sizes) - sizes, np.zeros(sizes.sum(), np.int32)
+        for image, box_px, start in zip(ids, boxes_px, starts, strict=True):
+            _count_before(image, item + 1, box_px, tables[start:])
         poses, intrinsics = views.world_to_camera[rows], views.intrinsics[rows]
         exact = intrinsics.astype(np.float64)
         matrices = exact @ poses[:, :3].astype(np.float64)
         return cls(
-            ids, item + 1, boxes_px, np.concatenate(tables), starts, matrices,
+            ids, item + 1, boxes_px, tables, starts, matrices,
             exact[:, 0, 0].copy(), boxes, views.sides_clear[rows, item], poses, intrinsics,
         )  # fmt: skip
 
@@ -148,6 +147,19 @@ def lift_shapes(
 
 
 # no_type_check: the tests' type hook wraps every function, and Numba cannot compile a wrapper.
+@njit(cache=True, nogil=True)
+@no_type_check
+def _count_before(image, own_id, box_px, table):
+    """Fill in the table of a view; its first row and column stay 0."""
+    x1, y1, x2, y2 = box_px
+    columns = x2 - x1 + 1
+    for row in range(y2 - y1):
+        total, place = 0, (row + 1) * columns
+        for column in range(x2 - x1):
+            total += image[y1 + row, x1 + column] == own_id
+            table[place + column + 1] = table[place - columns + column + 1] + total
+
+
 @njit(cache=True, nogil=True)
 @no_type_check
 def own_in(box_px, table, start, x1, y1, x2, y2):

@@ -144,11 +144,13 @@ def _extents_of(
     """The bounding box of the hull's cells in a box; the box itself if it has none."""
     cells = len(hull)
     first, last = ends[:, 0] * cells // LEVELS, -(-ends[:, 1] * cells // LEVELS)
-    found = np.argwhere(hull[tuple(itertools.starmap(slice, zip(first, last, strict=True)))])
-    if not len(found):
+    block = hull[tuple(itertools.starmap(slice, zip(first, last, strict=True)))]
+    # Asked thousands of times for a prototype: `argwhere` would take three times as long.
+    found = [block.any(axis=others).nonzero()[0] for others in ((1, 2), (0, 2), (0, 1))]
+    if not len(found[0]):
         return ends
-    low = (first + found.min(axis=0)) * LEVELS // cells
-    high = -(-(first + found.max(axis=0) + 1) * LEVELS // cells)
+    low = (first + [each[0] for each in found]) * LEVELS // cells
+    high = -(-(first + [each[-1] + 1 for each in found]) * LEVELS // cells)
     return np.stack([np.maximum(ends[:, 0], low), np.minimum(ends[:, 1], high)], axis=1)
 
 
