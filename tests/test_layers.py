@@ -46,7 +46,7 @@ BUDGET = {
     "sceneprior/render": (4490, 23),
     "sceneprior/training": (870, 5),
     "sceneprior/paper": (2405, 12),
-    "sceneprior/lifted": (7750, 38),
+    "sceneprior/lifted": (7764, 38),
     "sceneprior/baselines": (2909, 14),
     "sceneprior/evaluation": (4136, 20),
     "sceneprior/interchange": (892, 5),
