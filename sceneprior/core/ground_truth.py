@@ -11,7 +11,7 @@ import numpy as np
 from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.errors import InputError, ShardError
 from sceneprior.core.files import check_file, reading
-from sceneprior.core.scene import Mesh, Scene, SceneObject, mesh_of_file
+from sceneprior.core.scene import Mesh, Scene, SceneObject, Turned, mesh_of_file
 from sceneprior.core.shards import MODELS_FOLDER, Shard, iterate_rooms, splits_of
 
 
@@ -128,12 +128,27 @@ def reference_scene(
             mesh = _placed(Path(shards), truth.model_ids[row], truth.model_to_room[row])
         label = names[int(truth.object_class[row])]
         box = tuple(truth.centers_m[row].tolist()), tuple(truth.sizes_m[row].tolist())
-        objects.append(SceneObject(label, *box, mesh))
+        turned = _turned(float(truth.yaw_rad[row]), box[1])
+        objects.append(SceneObject(label, *box, mesh, turned))
     floor = np.asarray(truth.floor_m, dtype=np.float64)
     extra = {"room_id": room_id, "height_m": truth.height_m}
     return Scene(
         room_id, shard.label_set, tuple(objects), floor, extra, ceiling_m=float(truth.height_m)
     )
+
+
+def _turned(yaw_rad: float, size_m: Sequence[float]) -> Turned:
+    """The upright box at a yaw whose axis-aligned box has given extents; near 45 degrees, where
+    they do not determine it, the one with a square base."""
+    width, height, depth = size_m
+    cosine, sine = abs(np.cos(yaw_rad)), abs(np.sin(yaw_rad))
+    own = [(width + depth) / 2 / (cosine + sine)] * 2
+    if abs(spread := cosine**2 - sine**2) > 0.1:
+        solved = (
+            (cosine * width - sine * depth) / spread, (cosine * depth - sine * width) / spread
+        )  # fmt: skip
+        own = list(solved) if min(solved) > 0 else own
+    return Turned(yaw_rad, (own[0], height, own[1]))
 
 
 def _placed(shards: Path, model_id: str, model_to_room: np.ndarray) -> Mesh | None:

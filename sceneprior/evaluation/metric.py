@@ -212,8 +212,9 @@ class Metric:
     unit: str
     direction: Direction
     function: Callable[..., Any]
-    """Computes an `Estimate` from a `RoomSet` and a `Comparison`; None if it needs decoded training
-    rooms and there are none, and the result then leaves the metric out. A metric of `USED` rooms
+    """Computes an `Estimate`, or those of several metrics by key, from a `RoomSet` and a
+    `Comparison`; None if it needs decoded training rooms and there are none, and the result then
+    leaves the metric out. A metric of `USED` rooms
     computes the `Counts` of a scene, and one of `MATCHED` rooms a number from a list of
     `SceneMatch`."""
     sets: tuple[str, ...] = EACH_SET

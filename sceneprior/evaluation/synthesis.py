@@ -138,12 +138,18 @@ def evaluate_synthesis(
         if name not in sets:
             continue
         columns[name] = {}
+        several: dict[str, Estimate] = {}
         for metric in METRICS:
             if lacks[metric.key] is None and name in metric.sets:
                 pictured = name == "generated" and metric.network is not None
-                estimate = metric.function(sets["pictured" if pictured else name], comparison)
-                if estimate is not None:
-                    columns[name][metric.key] = estimate
+                found = several.get(metric.key)
+                if found is None:
+                    found = metric.function(sets["pictured" if pictured else name], comparison)
+                if isinstance(found, dict):
+                    several |= found
+                    found = found[metric.key]
+                if found is not None:
+                    columns[name][metric.key] = found
     notes = [emptiness(rooms.groups["generated"])]
     interval = columns["generated"]["layout_classifier_accuracy"].interval()
     if interval is not None and len(sets["test"].scenes) < FEW_TEST_ROOMS:

@@ -10,8 +10,8 @@ from pkgutil import iter_modules
 from sceneprior.evaluation.metric import DEFINED, MATCHED, USED
 
 _MODULES = (
-    "picture_distances", "picture_classifiers", "layouts", "contents", "placement", "support",
-    "navigation", "physics", "novelty",
+    "picture_distances", "picture_classifiers", "layouts", "function", "contents", "placement",
+    "support", "navigation", "physics", "novelty",
 )  # fmt: skip
 """Modules in the order in which tables show their metrics; other modules follow."""
 for _name in dict.fromkeys((*_MODULES, *(found.name for found in iter_modules(__path__)))):
