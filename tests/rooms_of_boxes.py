@@ -28,7 +28,7 @@ class Lifted(LiftedDataset):
     """Rooms without shards: what the sampler reads of lifted ones."""
 
     def __init__(self, boxes: list[LiftedBoxes], classes: list[int], shapes: list[Parts]):
-        self.rotations, self.label_set = 1, "toy"
+        self.rotations, self.label_set = 1, "void,sofa,box,pole"
         self.counts = [len(room.explained) for room in boxes]
         self.boxes = LiftedBoxes(*(np.concatenate(part) for part in zip(*boxes, strict=True)))
         columns = [np.split(part, np.cumsum(self.counts)[:-1]) for part in self.boxes]

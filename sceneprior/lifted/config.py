@@ -181,7 +181,7 @@ class LiftedConfig(PriorConfig):
         val = None
         with contextlib.suppress(ShardError):  # no val rooms: the newest network is kept
             list_shards(Path(self.data.shards), "val")
-            val = self._sampler_rooms("val").assign_prototypes(prototypes)
+            val = self._sampler_rooms("val").assign_prototypes(prototypes, rooms.backs)
         latents = nn.Embedding.from_pretrained(before.logits)
         return SamplerStage(before.prior, latents, sampler, stage, val, self.seed)
 

@@ -94,7 +94,7 @@ def test_prototypes_and_the_poses_in_which_objects_show_them(rooms, lifted):
         common=prototypes.common,
         filled=prototypes.grids.mean(axis=(1, 2, 3)),
         parts=[len(each.kind) for each in prototypes.parts],
-        looks=rooms.posed_prototypes(prototypes),
+        looks=rooms.posed_prototypes(prototypes)[0],
     )
 
 

@@ -283,7 +283,7 @@ def _scene_of(
     """Convert a sampled room to a scene with meshes; its floor is the room's rectangle, unless the
     request has another.
 
-    Yaws of objects are those of the fronts of their looks (`find_sides`). Given objects stay as
+    Yaws of objects are those of the fronts of their looks (`orient`). Given objects stay as
     they are; those without a mesh get that of their look.
     """
     sampler, shapes, rooms = trained.sampler, trained.prior.shape, drawn.rooms

@@ -184,13 +184,18 @@ class LiftedDataset(RoomDataset):
         grids = [filled_cells(each, self._shape.cells, self._shape.margin) for each in parts]
         return Prototypes(parts, np.stack(grids), sizes_m[items], labels[items], common)
 
-    def posed_prototypes(self, prototypes: Prototypes) -> Int[np.ndarray, " objects"]:
-        """The look of each object; -1 if it is not usable or its class has no prototype."""
+    def posed_prototypes(
+        self, prototypes: Prototypes
+    ) -> tuple[Int[np.ndarray, " objects"], Float[np.ndarray, "objects poses"]]:
+        """The look of each object, -1 if it is not usable or its class has no prototype; and the
+        error of its prototype in each pose (`explain_rays`)."""
         from sceneprior.lifted.lifting.prototype_fitting import explain_rays
 
         margin = self._shape.margin
-        looks = explain_rays(prototypes, self.rays, self.sizes_m, self.object_classes, margin)
-        return np.where(self.usable, looks, -1)
+        looks, errors = explain_rays(
+            prototypes, self.rays, self.sizes_m, self.object_classes, margin
+        )
+        return np.where(self.usable, looks, -1), errors
 
     def assign_prototypes(self, prototypes: Prototypes) -> None:
         """Assign a look to every object; no object has one before this.
@@ -198,7 +203,7 @@ class LiftedDataset(RoomDataset):
         The prototypes should come from the checkpoint, if there is one: recomputed on another
         processor, they may differ.
         """
-        looks = self._padded(self.posed_prototypes(prototypes), -1)
+        looks = self._padded(self.posed_prototypes(prototypes)[0], -1)
         self._rooms = replace(self._rooms, looks=looks.to(self._rooms.is_object.device))
 
     def to(self, device: torch.device | str) -> "LiftedDataset":

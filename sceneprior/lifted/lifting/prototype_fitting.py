@@ -90,14 +90,19 @@ def explain_rays(
     sizes_m: Float[np.ndarray, "objects 3"],
     object_class: Int[np.ndarray, " objects"],
     margin: float,
-) -> Int[np.ndarray, " objects"]:
-    """The look of each object: the prototype of its class and the pose that minimise
+) -> tuple[Int[np.ndarray, " objects"], Float[np.ndarray, "objects poses"]]:
+    """The look of each object: the prototype of its class and the pose that minimise its error,
 
         share of the object's rays explained wrongly + `SIZE_WEIGHT` (L1 distance of log extents).
 
-    Ties give the first look. The result is -1 if the object's class has no prototype.
+    Ties give the first look.
+
+    Returns:
+        The looks, -1 if the object's class has no prototype; and the errors of each object's
+        prototype in all poses, 0 for objects without one.
     """
     looks = np.full(len(object_class), -1, dtype=np.int64)
+    errors = np.zeros((len(object_class), POSES))
     offered = {}
     for label in np.unique(prototypes.object_class):
         own = np.flatnonzero(prototypes.object_class == label)
@@ -125,7 +130,7 @@ def explain_rays(
                 differ = np.abs(np.log(sizes_m[item]) - sizes).sum(axis=1)
                 wrong[:, pose] = counts / ASKED + SIZE_WEIGHT * differ
             row, pose = divmod(int(wrong.argmin()), POSES)
-            looks[item] = own[row] * POSES + pose
+            looks[item], errors[item] = own[row] * POSES + pose, wrong[row]
 
     in_threads(ask_some, len(looks))
-    return looks
+    return looks, errors

@@ -34,7 +34,7 @@ from sceneprior.core.shell import Wall
 from sceneprior.lifted.prototypes import PosedRooms
 from sceneprior.lifted.requests.floors import Floor, RoomShape
 from sceneprior.lifted.requests.wishes import OPENINGS, RelationWish
-from sceneprior.lifted.sampler.frames import side_of
+from sceneprior.lifted.sampler.frames import OUTWARD, side_of
 from sceneprior.lifted.sampler.network import RoomSampler
 
 BESIDE_M = 0.5
@@ -49,8 +49,6 @@ SECTOR_RAD = np.pi / 4
 """Half the angle of a sector."""
 REACH_M = 0.5
 """Maximum distance in front of a window at which an object may be `under` the window."""
-OUTWARD = np.array([(0.0, -1.0), (-1.0, 0.0), (0.0, 1.0), (1.0, 0.0)])
-"""Direction (x, z) towards the sides low z, low x, high z and high x (`side_of`)."""
 
 
 class Furniture(NamedTuple):

@@ -11,8 +11,9 @@ from jaxtyping import Bool, Float, Int
 
 from sceneprior.core.shell import space_before
 from sceneprior.lifted.requests.floors import RoomShape
-from sceneprior.lifted.requests.relations import OUTWARD, Furniture, RelationChecks, footprints
+from sceneprior.lifted.requests.relations import Furniture, RelationChecks, footprints
 from sceneprior.lifted.requests.wishes import RelationWish
+from sceneprior.lifted.sampler.frames import OUTWARD
 
 FLUSH_M = 0.15
 """Maximum gap between an object's back and a side of its rectangle in the floor at which the object

@@ -9,6 +9,7 @@ cases are learnt as one.
 
 from dataclasses import replace
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -21,6 +22,8 @@ GRAZE_M = 0.05
 inaccuracy."""
 FRAME_M = 0.15
 """Standard deviation of the noise by which rectangles are larger than their furniture."""
+OUTWARD = np.array([(0.0, -1.0), (-1.0, 0.0), (0.0, 1.0), (1.0, 0.0)])
+"""Outward directions (x, z) of the sides low z, low x, high z and high x."""
 SYMMETRIES = 2 * QUARTERS
 """Symmetries of a room: mirrored or not, times the quarter turns; 0 is the untransformed room."""
 

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
+from sceneprior.core.classes import label_set
 from sceneprior.core.wall_lines import Wall
 from sceneprior.lifted.lifting.dataset import LiftedDataset
 from sceneprior.lifted.prototypes import PosedRooms, Prototypes
@@ -20,6 +21,7 @@ from sceneprior.lifted.sampler.frames import (
     rectangles_of,
     shared_extents,
 )
+from sceneprior.lifted.sampler.orientation import gaps_to_walls, orient
 
 LOOSELY = 2.0
 """Range of the random offset of log footprints in `large_first`."""
@@ -57,15 +59,21 @@ class SamplerRooms:
         self._lifted = lifted
         self.prototypes: Prototypes
         self.rooms: PosedRooms
+        self.to_walls_m: Float[Tensor, "rooms objects 4"]
+        self.backs: Int[Tensor, " prototypes"]
+        self.confidence: Float[Tensor, " prototypes"]
 
-    def assign_prototypes(self, prototypes: Prototypes) -> "SamplerRooms":
+    def assign_prototypes(
+        self, prototypes: Prototypes, backs: Int[Tensor, " prototypes"] | None = None
+    ) -> "SamplerRooms":
         """Set `rooms`, in which every object has a look, and return this data set.
 
-        Only common prototypes are used, since rare prototypes are often errors of lifting.
+        Only common prototypes are used, since rare prototypes are often errors of lifting. `backs`
+        are the sides of their backs; if they are not given, they are found, too (`orient`).
         """
         lifted, prototypes = self._lifted, prototypes.common_alone()
         boxes_m = np.hstack(lifted.boxes[:2])
-        looks = lifted.posed_prototypes(prototypes)
+        looks, errors = lifted.posed_prototypes(prototypes)
         rows = np.split(np.arange(len(looks)), np.cumsum(lifted.counts)[:-1])
         kept = [torch.from_numpy(row[looks[row] >= 0]) for row in rows]
 
@@ -85,6 +93,16 @@ class SamplerRooms:
             for each in zip(lifted.walls, rectangles_of(self.rooms).numpy(), strict=True)
         ]
         self.rooms = replace(self.rooms, walls_m=torch.tensor(walls, dtype=torch.float32))
+        to_walls = [
+            torch.from_numpy(gaps_to_walls(boxes_m[row.numpy()], walls))
+            for row, walls in zip(kept, lifted.walls, strict=True)
+        ]
+        self.to_walls_m = pad_sequence(to_walls, batch_first=True)
+        self.backs, self.confidence, looks = orient(
+            self.rooms, self.to_walls_m, padded(errors), prototypes,
+            label_set(self.label_set), backs,
+        )  # fmt: skip
+        self.rooms = replace(self.rooms, looks=looks)
         return self
 
     def __len__(self) -> int:

@@ -72,7 +72,7 @@ def test_what_has_no_label_or_no_box_has_no_look(shards):
     data.object_classes[0] = VOID
     data.boxes.explained[1] = 0
     assert data.usable.tolist()[:3] == [False, False, True]
-    assert data.posed_prototypes(prototypes).tolist()[:2] == [-1, -1]
+    assert data.posed_prototypes(prototypes)[0].tolist()[:2] == [-1, -1]
     data.assign_prototypes(prototypes)
     assert data.__getitems__([(0, 0)]).looks[0, :2].tolist() == [-1, -1]
 
