@@ -1,10 +1,9 @@
 """Rectangles, gaps and turns of rooms as boxes: the frames in which the sampler sees rooms and
 objects.
 
-The frame of an object is its room, turned so that the object's back is at low z. The back of a
-prototype is its side that is nearest to a side of the room's rectangle on average. In its own
-frame, a bed stands at the same place whichever of the four walls it stands against, so all four
-cases are learnt as one.
+The frame of an object is its room, turned so that the object's back (`orientation.py`) is at low z.
+In its own frame, a bed stands at the same place whichever of the four walls it stands against, so
+all four cases are learnt as one.
 """
 
 from dataclasses import replace
