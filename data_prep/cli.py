@@ -279,7 +279,6 @@ def inspect(
 
     from data_prep.inspection.pictures import draw_sheet
     from data_prep.inspection.tables import count_tables, room_table
-    from sceneprior.core.errors import InputError
     from sceneprior.core.files import write_whole
     from sceneprior.render.appearance import png_bytes
 
@@ -291,13 +290,7 @@ def inspect(
     if png is not None or not verify:
         target = png or shards / _SHEET
         sheet = draw_sheet(shards, room, pictures)
-        try:
-            write_whole(target, png_bytes(sheet))
-        except OSError as error:
-            raise InputError(
-                f"{target} cannot be written ({error.strerror or error}); name another file with "
-                "--png."
-            ) from None
+        write_whole(target, png_bytes(sheet))
         typer.echo(f"Drew {target}.")
 
 

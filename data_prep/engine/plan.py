@@ -13,7 +13,7 @@ from pydantic import TypeAdapter
 
 from data_prep.engine.source import Line, RoomTask, Source, Survey
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import list_files, read_table, reading
+from sceneprior.core.files import file_stamp, list_files, read_table, reading
 from sceneprior.core.shards import INDEX_NAME, SPLITS
 
 PLAN_NAME = "plan.json"
@@ -68,11 +68,7 @@ def read_plan(out: Path, source: Source, settings: dict[str, Any], renderer: str
         if list_files(out, "*.h5", deep=True) or (out / INDEX_NAME).exists():
             raise InputError(f"{out} holds shards without a {PLAN_NAME}; choose a new folder.")
         return None
-
-    def damaged(_: Exception) -> InputError:
-        return InputError(f"{path} cannot be read; choose a new folder, or delete {out}.")
-
-    with reading(path, damaged):
+    with reading(path, then=f"; choose a new folder, or delete {out}."):
         data = json.loads(path.read_bytes())
         before = dict(data["settings"])
         if (version := before["plan_version"]) != PLAN_VERSION:
@@ -100,10 +96,7 @@ def digest(text: str) -> str:
 
 def digest_of_files(paths: Sequence[Path]) -> str:
     """Fingerprint of names and sizes: quick, and enough to notice another release."""
-    try:
-        return digest("".join(f"{path.name} {path.stat().st_size}\n" for path in paths))
-    except OSError as error:
-        raise InputError(f"{error.filename} cannot be read ({error.strerror}).") from None
+    return digest("".join(f"{path.name} {file_stamp(path)[1]}\n" for path in paths))
 
 
 def house_may_match(only: str | None, house: str) -> bool:

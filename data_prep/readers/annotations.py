@@ -11,7 +11,7 @@ import numpy as np
 from sceneprior.core.checked import plain
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import cause_of, open_hdf5, read_table, reading
+from sceneprior.core.files import open_hdf5, read_table, reading
 from sceneprior.core.id_tables import LARGEST_ID, stuff_of
 
 _MOST_VALUES = 64 << 20
@@ -64,12 +64,7 @@ def read_hdf5(path: Path, names: Sequence[str], hint: str) -> list[np.ndarray]:
 
     if not path.is_file():
         raise InputError(f"{path} is missing; {hint}.")
-
-    def damaged(error: Exception) -> InputError:
-        reason = plain(cause_of(error), 120)
-        return InputError(f"{path} cannot be read ({reason}): it is damaged; {hint}.")
-
-    with reading(path, damaged), open_hdf5(path) as file:
+    with reading(path, then=f": it is damaged; {hint}."), open_hdf5(path) as file:
         missing = [name for name in names if not isinstance(file.get(name), h5py.Dataset)]
         if missing:
             there = ", ".join(plain(str(name)) for name in list(file)[:8]) or "nothing"

@@ -165,7 +165,7 @@ def _remove_empty(folders: list[Path]) -> None:
 
 def file_stamp(path: Path) -> tuple[int, int]:
     """Modification time (ns) and size (bytes) of a file, to detect changes."""
-    status = check_file(path)
+    status = check_file(path, sys.maxsize)
     return status.st_mtime_ns, status.st_size
 
 
@@ -315,9 +315,14 @@ def open_hdf5(path: Path, whole: bool = False) -> "h5py.File":
 
 
 @contextlib.contextmanager
-def reading(path: Path, damaged: Callable[[Exception], InputError]) -> Iterator[None]:
-    """Raise errors of the system, such as of permissions, as such; others as that of a `damaged`
-    file, whose library may raise anything."""
+def reading(
+    path: Path, says: str = " cannot be read", then: str = ".", kind: type[InputError] = InputError
+) -> Iterator[None]:
+    """Raise an error of damage, of any type, as `<path><says> (<reason>)<then>`.
+
+    Errors of the system, such as of permissions, have a sentence of their own: what `then` advises
+    may be to delete the file.
+    """
     try:
         yield
     except MemoryError:
@@ -327,7 +332,7 @@ def reading(path: Path, damaged: Callable[[Exception], InputError]) -> Iterator[
             raise
         if isinstance(error, OSError) and error.errno is not None:
             raise _unread(error.filename or path, cause_of(error)) from None
-        raise damaged(error) from None
+        raise kind(f"{path}{says} ({cause_of(error)}){then}") from None
 
 
 def is_name(text: Any) -> bool:

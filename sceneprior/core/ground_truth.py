@@ -176,14 +176,9 @@ def load_model(path: Path) -> Mesh:
         )
     import trimesh
 
-    def damaged(error: Exception) -> ShardError:
-        return ShardError(
-            f"{path} is not a triangle mesh ({type(error).__name__}: {error}). Delete it and run "
-            "`sceneprior prep-front` again."
-        )
-
     check_file(path)
-    with reading(path, damaged):
+    then = ". Delete it and run `sceneprior prep-front` again."
+    with reading(path, " is not a triangle mesh", then, ShardError):
         model = trimesh.load_mesh(path, process=False)
         return mesh_of_file(np.asarray(model.vertices, dtype=np.float64), model.faces)
 

@@ -2,7 +2,6 @@
 
 import json
 import re
-import zlib
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
@@ -14,7 +13,7 @@ from PIL import Image
 from sceneprior.core.checked import plain
 from sceneprior.core.classes import STUFF, VOID, label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import check_file, read_table, read_text
+from sceneprior.core.files import check_file, read_table, read_text, reading
 
 SHELL = frozenset(
     ["background", "wall", "floor", "ceiling", "door", "window", "blinds", "mirror", "picture"]
@@ -191,19 +190,13 @@ def read_rgb(path: Path) -> np.ndarray:
 
 
 def _pixels(path: Path, rgb: bool) -> np.ndarray:
-    try:
-        with _open(path, rgb) as picture:
-            return np.asarray(picture)
-    except InputError:
-        raise
-    except (OSError, ValueError, SyntaxError, EOFError, MemoryError, zlib.error) as error:
-        why = str(error)[:120] or "a part of it is said to be too large for memory"
-        raise InputError(f"{path} is damaged ({why}).") from None
+    with reading(path, " is damaged"), _open(path, rgb) as picture:
+        return np.asarray(picture)
 
 
 def _open(path: Path, rgb: bool) -> Image.Image:
     check_file(path)
-    try:
+    with reading(path, " is not a readable PNG"):
         with path.open("rb") as file:
             kind = png_kind(file.read(_HEADER_BYTES))
         if kind is None:
@@ -220,7 +213,3 @@ def _open(path: Path, rgb: bool) -> Image.Image:
         if not known:
             raise InputError(f"{path} is {kind[0]}-bit {kind[1]}; expected {wanted}.")
         return Image.open(path, formats=("PNG",))
-    except InputError:
-        raise
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise InputError(f"{path} is not a readable PNG ({str(error)[:120]}).") from None

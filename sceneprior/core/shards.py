@@ -12,7 +12,7 @@ from zlib_ng import zlib_ng
 
 from sceneprior.core.classes import STUFF, label_set
 from sceneprior.core.errors import ShardError
-from sceneprior.core.files import cause_of, is_name, list_files, open_hdf5, read_json, reading
+from sceneprior.core.files import is_name, list_files, open_hdf5, read_json, reading
 from sceneprior.core.observations import RoomGroundTruth, RoomViews, stuff_size, thinned
 
 if TYPE_CHECKING:
@@ -25,6 +25,7 @@ READABLE = (1, VERSION)
 INDEX_NAME = "index.json"
 PREPARE = "`sceneprior prep-front`, `prep-scannet`, `prep-posed` or `prep-dataset`"
 """Commands that write shards, for messages."""
+_DAMAGED = f": the file is damaged. Delete it and run the same {PREPARE} command again."
 MODELS_FOLDER = "models"
 SPLITS = ("train", "val", "test")
 """Rooms for training, for choosing settings and checkpoints, and for reporting results."""
@@ -62,7 +63,7 @@ class Shard(contextlib.AbstractContextManager["Shard"]):
         self.path = Path(path)
         if not self.path.is_file():
             raise ShardError(f"No shard at {path}; {PREPARE} writes shards.")
-        with reading(self.path, lambda error: _damaged(self.path, error)):
+        with reading(self.path, then=_DAMAGED, kind=ShardError):
             self._file = open_hdf5(self.path, whole=True)
             form = _decoded(self._file.attrs.get("format"))
             version = self._file.attrs.get("version")
@@ -95,7 +96,7 @@ class Shard(contextlib.AbstractContextManager["Shard"]):
     @contextlib.contextmanager
     def _group(self, room_id: str) -> Iterator["h5py.Group"]:
         """Open a room's group; errors in the block are raised as damage of the shard."""
-        with reading(self.path, lambda error: _damaged(self.path, error, room_id)):
+        with reading(self.path, f", room {room_id} cannot be read", _DAMAGED, ShardError):
             yield self._file["rooms"][self._keys[room_id]]
 
     def read_room(self, room_id: str, images: bool = False) -> RoomViews:
@@ -268,14 +269,6 @@ def _inflate(images: "h5py.Dataset", view: int) -> np.ndarray:
         return images[view]
     return np.frombuffer(zlib_ng.decompress(chunk, bufsize=size), images.dtype).reshape(
         images.shape[1:]
-    )
-
-
-def _damaged(path: Path, error: Exception, room_id: str = "") -> ShardError:
-    where = f", room {room_id}" if room_id else ""
-    return ShardError(
-        f"{path}{where} cannot be read ({cause_of(error)}): the file is damaged. "
-        f"Delete it and run the same {PREPARE} command again."
     )
 
 

@@ -321,15 +321,9 @@ def find_checkpoint(run: Path, stages: Sequence[str]) -> tuple[str, Path]:
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
     """The contents of a checkpoint: tensors and plain data only."""
-
-    def damaged(error: Exception) -> InputError:
-        return InputError(
-            f"{path} cannot be read ({type(error).__name__}); it is damaged. Delete it and run "
-            "`sceneprior fit` with `--resume`."
-        )
-
     check_file(path)
-    with reading(path, damaged):
+    then = "; it is damaged. Delete it and run `sceneprior fit` with `--resume`."
+    with reading(path, then=then):
         saved = torch.load(path, map_location="cpu", weights_only=True)
     if not isinstance(saved, dict) or not isinstance(saved.get("state_dict"), dict):
         raise InputError(

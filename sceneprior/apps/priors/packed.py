@@ -200,15 +200,8 @@ def is_packed(path: Path) -> bool:
 
 def read_packed(path: Path) -> PackedPrior:
     """Read a packed prior. Nothing in it is executed, and nothing is written."""
-
-    def damaged(error: Exception) -> InputError:
-        reason = " ".join(str(error).split())[:200]
-        return InputError(
-            f"{path} is not a packed prior, or is damaged ({type(error).__name__}: {reason}); "
-            "fetch it again, or have it packed again with `sceneprior pack RUN --out FILE`."
-        )
-
-    with reading(path, damaged):
+    then = "; fetch it again, or have it packed again with `sceneprior pack RUN --out FILE`."
+    with reading(path, " is not a packed prior, or is damaged", then):
         card, described, weights = (_contents(path, name) for name in FILES)
         data = json.loads(described)
         if (data["format"], data["version"]) != (FORMAT, VERSION):

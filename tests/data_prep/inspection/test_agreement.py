@@ -68,7 +68,7 @@ def test_models_that_are_missing_or_damaged_are_named(made, tmp_path):
     path = shards / "models" / f"{truth.model_ids[0]}.ply"
     path.write_bytes(path.read_bytes()[:-20])
     hull_of_model.cache_clear()
-    with pytest.raises(ShardError, match=r"\.ply is not a triangle mesh \(\w+: "):
+    with pytest.raises(ShardError, match=r"\.ply is not a triangle mesh \("):
         hull_of_model(path)
     path.unlink()
     room, problems = room_of(views, truth, shards)
