@@ -87,14 +87,10 @@ def read_scores(path: Path | None, folder: Path, shards: Path, evaluated: str) -
         path = folder / "scores.json"
         if not path.exists() and not known_in_3d(shards, "test"):
             return {}
-    try:
-        found = read_json(path)
-        if not isinstance(found, dict) or found.get("format") != FORMAT:
-            raise ValueError("another file")
-    except ValueError as error:
-        raise InputError(
-            f"{path} holds no scores ({error}); write them with `sceneprior eval-fid {evaluated}`."
-        ) from None
+    hint = f"write them with `sceneprior eval-fid {evaluated}`"
+    found = read_json(path, hint=hint)
+    if not isinstance(found, dict) or found.get("format") != FORMAT:
+        raise InputError(f"{path} holds no scores (another file); {hint}.")
     return found
 
 
