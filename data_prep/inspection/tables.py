@@ -132,10 +132,11 @@ def verdict(found: FolderCheck) -> str:
     in_3d = any(tally.whole for tally in tallies.values())
     unchecked = [] if in_3d else what_was_checked(evidence)[1]
     if not tallies:
+        scales = [room.evidence.scale for room in found.every if room.evidence]
         if evidence.scale is None:
             sized = sum(bool(size.name) for size in evidence.sizes)
             unchecked.append(f"the scale ({sized} objects of known size)")
-        elif alone := sum(room.evidence and not room.evidence.scale for room in found.every):
+        elif alone := scales.count(None):
             unchecked.append(f"the scale of {alone} rooms, each for itself (too few objects)")
         unchecked += ["the height of the floor"] * (evidence.floor_m is None)
         unchecked.append("whether all pictures are mirror images")
