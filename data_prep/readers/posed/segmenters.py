@@ -192,7 +192,7 @@ class GroundedSam2(MaskFormat):
     def frames(self) -> dict[str, FrameMask]:
         return {
             path.stem.removeprefix(PREFIX): FrameMask(
-                lambda path=path: _read_ids(path).shape,
+                partial(lambda each: _read_ids(each).shape, path),
                 partial(_read_ids, path),
                 partial(_labels, self.folder / LABELS / f"{path.stem}.json"),
             )
