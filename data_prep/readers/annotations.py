@@ -171,7 +171,7 @@ def ids_and_classes(
     count = int(numbers.max(initial=0)) + 1
     keys = (numbers * len(names) + semantics).ravel()
     votes = np.bincount(keys, minlength=count * len(names)).reshape(count, len(names))
-    best = votes.argmax(axis=1)
+    best = (2 * votes - np.eye(1, len(names), dtype=int)).argmax(axis=1)  # void loses ties
     ids = np.where(is_shell[best], 0, np.arange(count)).astype(np.int32)[numbers]
     ids[numbers == 0] = np.where(is_shell[semantics[numbers == 0]], 0, -1)
     found = np.flatnonzero(votes.any(axis=1) & ~is_shell[best]).tolist()

@@ -274,6 +274,8 @@ class ScanObject(NamedTuple):
     category: str
     part: np.ndarray
     """Indices of its vertices; empty if the mesh has none of its segments."""
+    others: tuple[int, ...] = ()
+    """Further numbers of the same object."""
 
 
 class AnnotatedMesh(NamedTuple):
@@ -300,6 +302,13 @@ def read_annotated_mesh(
             notes.append(f"object {number} is listed twice; its parts were joined")
         categories.setdefault(number, entry.label)
         segments_of[number] = segments_of.get(number, frozenset()) | entry.segments
+    # Some scans, such as scene0217_00, list every object twice, and masks may show either number.
+    numbers: dict[object, list[int]] = {}
+    for number in sorted(categories):
+        numbers.setdefault(segments_of[number] or number, []).append(number)
+    for first, *others in numbers.values():
+        told = "is listed again with the same segments, as"
+        notes += [f"object {first} {told} {', '.join(map(str, others))}; one object"] * bool(others)
     why = "it assigns the parts of the mesh to objects"
     listed = _read_json(_Segmentation, segments_path, why).segIndices
     if len(listed) != len(mesh.vertices_m):
@@ -310,8 +319,13 @@ def read_annotated_mesh(
         )
     segments = np.array(listed, dtype=np.int64)
     objects = [
-        ScanObject(number, category, np.flatnonzero(np.isin(segments, [*segments_of[number]])))
-        for number, category in sorted(categories.items())
+        ScanObject(
+            number,
+            categories[number],
+            np.flatnonzero(np.isin(segments, [*segments_of[number]])),
+            tuple(others),
+        )
+        for number, *others in numbers.values()
     ]
     vertices_m = to_camera(mesh.vertices_m, world_from_mesh)
     return AnnotatedMesh(Mesh(vertices_m, mesh.faces), objects, notes)

@@ -198,10 +198,11 @@ class ScanNet(Reader):
         table[0] = 0
         known = [0]
         for k, item in enumerate(objects, start=1):
-            if item.object_id < 255:  # an 8-bit mask cannot show more
-                known.append(item.object_id + 1)
-                table[known[-1]] = 0 if labels.is_shell(item.category) else k
-                stuff_table[known[-1]] = labels.stuff(item.category)
+            for number in (item.object_id, *item.others):
+                if number < 255:  # an 8-bit mask cannot show more
+                    known.append(number + 1)
+                    table[known[-1]] = 0 if labels.is_shell(item.category) else k
+                    stuff_table[known[-1]] = labels.stuff(item.category)
         mask_path, sens_path = self._mask_path(folder), folder / f"{folder.name}.sens"
         sens = read_sens(sens_path)
         images, stuff, unlisted = [], [], set[int]()

@@ -10,6 +10,8 @@ multicuts", ICCV 2015).
 import numpy as np
 from jaxtyping import Float, Int
 
+from sceneprior.core.classes import VOID
+
 SAME, OTHER = 0.75, 0.08
 """Probability that a cell shown by one mask is also shown by the other mask, for two masks of the
 same object and of different objects."""
@@ -105,9 +107,9 @@ def cluster(weights: Float[np.ndarray, "masks masks"]) -> Int[np.ndarray, " mask
 def main_classes(
     labels: Int[np.ndarray, " masks"], mask_class: Int[np.ndarray, " masks"]
 ) -> Int[np.ndarray, " clusters"]:
-    """The most frequent class among the masks of each cluster."""
-    clusters = range(int(labels.max()) + 1)
-    return np.array([np.bincount(mask_class[labels == k]).argmax() for k in clusters])
+    """The most frequent class among the masks of each cluster; void loses ties."""
+    votes = [2 * np.bincount(mask_class[labels == k]) for k in range(int(labels.max()) + 1)]
+    return np.array([(own - (np.arange(len(own)) == VOID)).argmax() for own in votes])
 
 
 def _contract(weights: np.ndarray, labels: np.ndarray) -> np.ndarray:

@@ -14,10 +14,10 @@ from data_prep.readers.posed.cameras import Lens, Straightened, straighten
 from data_prep.readers.posed.recording import PosedFrame, frame_intrinsics
 from data_prep.tracks.associate import UNKNOWN, FrameMasks, associate
 from sceneprior.core.checked import plain, shown
-from sceneprior.core.classes import VOID
+from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.coco import check_size, decode, paint
 from sceneprior.core.errors import InputError
-from sceneprior.core.id_tables import LARGEST_ID, IdTable, read_mask
+from sceneprior.core.id_tables import LARGEST_ID, IdTable, read_mask, tidy
 from sceneprior.core.observations import thinned_stuff
 
 PANOPTIC = "panoptic.json"
@@ -114,7 +114,9 @@ class MaskFormat(ABC):
 
     def classes(self) -> dict[int, str]:
         """Class of each id, if ids are the same in all frames."""
-        classes, self.notes = main_classes(frame.classes() for frame in self.frames.values())
+        classes, self.notes = main_classes(
+            (frame.classes() for frame in self.frames.values()), self.label_set_name
+        )
         return classes
 
 
@@ -142,9 +144,11 @@ def find_table(folder: Path) -> Path:
     return found[0]
 
 
-def main_classes(of_frames: Iterable[dict[int, str]]) -> tuple[dict[int, str], list[str]]:
-    """The most frequent class of each id over all frames, and a note on ids with several
-    classes."""
+def main_classes(
+    of_frames: Iterable[dict[int, str]], label_set_name: str
+) -> tuple[dict[int, str], list[str]]:
+    """The most frequent class of each id over all frames, one of the label set if several are, and
+    a note on ids with several classes."""
     votes: dict[int, Counter[str]] = {}
     for classes in of_frames:
         for number, name in classes.items():
@@ -155,7 +159,11 @@ def main_classes(of_frames: Iterable[dict[int, str]]) -> tuple[dict[int, str], l
         if len(count) > 1
     ]
     notes = [f"ids with several classes take the most frequent one: {_some(changing)}"]
-    most = {number: count.most_common(1)[0][0] for number, count in sorted(votes.items())}
+    own = {tidy(name) for name in label_set(label_set_name)}
+    most = {
+        number: max(count, key=lambda name, count=count: (count[name], tidy(name) in own))
+        for number, count in sorted(votes.items())
+    }
     return most, notes if changing else []
 
 

@@ -205,7 +205,7 @@ class GroundedSam2(MaskFormat):
 
     def classes(self) -> dict[int, str]:
         paths = list_files(self.folder / LABELS, f"{PREFIX}*.json")
-        classes, self.notes = main_classes(map(_labels, paths))
+        classes, self.notes = main_classes(map(_labels, paths), self.label_set_name)
         if not classes:
             raise InputError(
                 f"{self.folder / LABELS} names no class; expected {PREFIX}<frame>.json for each "

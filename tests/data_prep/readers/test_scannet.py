@@ -184,6 +184,22 @@ def test_notes_tell_what_was_left_out(scan, reader):
     )
 
 
+def test_entries_with_equal_segments_are_one_object(scan, reader):
+    """scene0217_00 lists every object twice; its masks may show either number."""
+    scan.write()
+    once, _ = painted(scan, reader, (2, 5, 10, 30, 40), (3, 40, 10, 60, 40))
+    path = scan.path(".aggregation.json")
+    data = json.loads(path.read_text())
+    again = [group | {"objectId": group["objectId"] + 100} for group in data["segGroups"]]
+    path.write_text(json.dumps({**data, "segGroups": [*again, *data["segGroups"]]}))
+    twice, _ = painted(scan, reader, (102, 5, 10, 30, 40), (3, 40, 10, 60, 40))
+    for name in ("object_class", "instance_ids", "boxes"):
+        assert np.array_equal(getattr(once.views, name), getattr(twice.views, name))
+    assert np.array_equal(once.truth.centers_m, twice.truth.centers_m)
+    told = [note for note in twice.notes if "is listed again with the same segments" in note]
+    assert len(told) == len(again)
+
+
 def painted(scan, reader, *rectangles):
     """The made scan with one mask painted by hand, stored pixel for pixel, and that mask."""
     image = np.zeros((60, 80), dtype=np.uint8)

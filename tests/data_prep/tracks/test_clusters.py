@@ -4,7 +4,9 @@ import itertools
 
 import numpy as np
 
-from data_prep.tracks.clusters import cluster
+from data_prep.readers.annotations import NYU40, ids_and_classes
+from data_prep.readers.posed.masks import main_classes as main_names
+from data_prep.tracks.clusters import cluster, main_classes
 
 
 def partitions(count):
@@ -52,3 +54,16 @@ def test_no_single_move_gains():
     for one, other in itertools.combinations(range(labels.max() + 1), 2):
         joined = np.where(labels == other, one, labels)
         assert total_weight(weights, joined) <= total + 1e-9
+
+
+def test_void_loses_ties_wherever_classes_are_voted_on():
+    """Views or frames that name no class do not outweigh as many that name one; more of them do."""
+    bed = NYU40.index("bed") + 1
+    for voids, beds in itertools.product(range(3), range(1, 3)):
+        wins = beds >= voids
+        votes = np.array([0] * voids + [bed] * beds)
+        assert main_classes(np.zeros(len(votes), int), votes).tolist() == [bed * wins]
+        _, names, _ = ids_and_classes(np.full((1, len(votes)), 7), votes[None], "scene")
+        assert names == {8: "bed" if wins else "void"}
+        frames = [{1: "bed chair"}] * voids + [{1: "Bed"}] * beds
+        assert main_names(frames, "void,bed")[0] == {1: "Bed" if wins else "bed chair"}
