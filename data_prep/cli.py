@@ -92,10 +92,8 @@ def prep_front(
     from data_prep.front.recipe import load_recipe
     from data_prep.front.source import FrontSource
 
-    changes = list(rule or [])
-    if views_per_m2 is not None:
-        changes.append(f"views.per_m2={views_per_m2}")
-    rules = load_recipe(recipe, tuple(changes))
+    density = () if views_per_m2 is None else (f"views.per_m2={views_per_m2}",)
+    rules = load_recipe(recipe, (*(rule or ()), *density))
     source = FrontSource(front, future, rules, splits, seed, only)
     run_job(source, out, workers, retry_failed=retry_failed, renderer=renderer)
 
@@ -166,6 +164,7 @@ def prep_posed(
             "again for the masks: png, panoptic, sam2, grounded-sam2, coco (default: guessed).",
         ),
     ] = None,
+    model: Annotated[int | None, typer.Option(help="COLMAP model (default: the largest).")] = None,
     up: Annotated[
         str,
         typer.Option(
@@ -210,7 +209,7 @@ def prep_posed(
         rooms, classes=read_label_set(label_set), **read_formats(tools or ()), up=up,
         floor_m=floor_m, camera_height_m=camera_height_m, metres_per_unit=metres_per_unit,
         max_side=max_side, tracks=tracks, max_views=max_views, test_share=test_share, seed=seed,
-        only=only,
+        only=only, model=model,
     )  # fmt: skip
     for sentence in source.found():
         typer.echo(f"Found {sentence}", err=True)

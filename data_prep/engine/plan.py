@@ -12,6 +12,7 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from data_prep.engine.source import Line, RoomTask, Source, Survey
+from sceneprior.core.checked import plain
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import file_stamp, list_files, read_table, reading
 from sceneprior.core.shards import INDEX_NAME, SPLITS
@@ -121,14 +122,17 @@ def is_asked_for(only: str | None, room_id: str, house: str) -> bool:
 
 
 def read_splits(path: Path) -> dict[str, str]:
-    """Read the split of each room id from a CSV of `room id,split`; other rows are skipped."""
-    rows = read_table(path, "name a split file")
+    """Read the split of each room or scene from a CSV of `id,split`, or with columns between the
+    two, as in Hypersim's list of images; other rows are skipped."""
     meaning = {"train": "train", "test": "test", "val": "val", "validation": "val"}
-    found = {
-        row[0].strip(): meaning[row[1].strip().lower()]
-        for row in rows
-        if len(row) >= 2 and row[1].strip().lower() in meaning
-    }
+    found: dict[str, str] = {}
+    for name, *cells in filter(None, read_table(path, "name a split file")):
+        words = [cell.strip().lower() for cell in cells]
+        split = next((meaning[word] for word in words if word in meaning), None)
+        if split is not None and (other := found.setdefault(name.strip(), split)) != split:
+            raise InputError(
+                f"{path}: {plain(name)} is in {other} and in {split}; expected one split."
+            )
     if not found:
         raise InputError(f"{path} has no rows `room id,split` with split train, val or test.")
     return found

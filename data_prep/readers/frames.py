@@ -185,7 +185,8 @@ def mask_intrinsics(
         raise InputError(
             f"The masks are {mask_size[1]} x {mask_size[0]} pixels but the colour frames "
             f"{color_size[1]} x {color_size[0]}: with different aspect ratios they do not show the "
-            "same picture. Use the masks that belong to this recording."
+            f"same picture.{turned_hint(mask_size, color_size)} Use the masks that belong to this "
+            "recording."
         )
     intrinsics = np.array(intrinsics, dtype=np.float64)
     # Axis 0 is u (width), axis 1 is v (height).
@@ -197,6 +198,16 @@ def mask_intrinsics(
         intrinsics[axis, 2] -= late
         intrinsics[axis] /= step
     return intrinsics
+
+
+def turned_hint(size: tuple[int, ...], other: tuple[int, ...]) -> str:
+    """Sentence on the likely cause of images, (height, width), that differ by a quarter turn."""
+    if abs(size[0] / size[1] / (other[1] / other[0]) - 1) > _ASPECT_SLACK:
+        return ""
+    return (
+        " They seem turned by 90 degrees: some programs turn pictures as their EXIF orientation "
+        "says, others do not. Turn the masks as the pictures of the poses are."
+    )
 
 
 def sampled(

@@ -23,12 +23,13 @@ from scipy.spatial.transform import Rotation
 from data_prep.readers.frames import GL_TO_CV
 from data_prep.readers.posed.cameras import Camera, Number
 from data_prep.readers.posed.recording import PosedFrame
+from data_prep.readers.reader import by_number
 from sceneprior.core.checked import checked, plain, shown
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import list_files, read_bytes, read_json, read_text
+from sceneprior.core.files import list_files, list_folders, read_bytes, read_json, read_text
 
-FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
-"""Folders in which COLMAP or nerfstudio put a model."""
+FOLDERS = ("sparse/*", "sparse", "colmap/sparse/*")
+"""Folders in which COLMAP or nerfstudio put a model; `*` is a number, one for each model."""
 _MODELS = {
     0: ("SIMPLE_PINHOLE", "f cx cy"),
     1: ("PINHOLE", "fl_x fl_y cx cy"),
@@ -41,6 +42,8 @@ _MODELS = {
 }
 """Name and parameters of a camera model by COLMAP's number. Parameters have their names in
 transforms.json; `f` stands for both focal lengths."""
+_NUMBERS = frozenset("0123456789+-.eE \t")
+"""Characters of the lines of points in a model's text."""
 _BYTES_A_POINT = 24
 _LONGEST_NAME = 4096
 KEYFRAMES = ("keyframes/corrected_cameras", "keyframes/cameras")
@@ -50,6 +53,7 @@ METADATA = ("metadata", "metadata.json", "EXR_RGBD/metadata", "EXR_RGBD/metadata
 _OFF = 0.01
 """Largest deviation of a quaternion's length from 1."""
 _ENTRIES = [[f"t_{row}{column}" for column in range(4)] for row in range(3)]
+_SIZE = ("width", "height")
 _FIELDS: dict[str, Any] = {
     **{key: (Number, ...) for key in ("fx", "fy", "cx", "cy", "width", "height")},
     **{key: (float, ...) for row in _ENTRIES for key in row},
@@ -58,13 +62,43 @@ _Keyframe = create_model("_Keyframe", __config__=ConfigDict(strict=True), **_FIE
 
 
 def model_files(folder: Path) -> list[Path]:
-    """Find a model's files of cameras and of images, preferably binary; empty without a model."""
+    """Find the files of cameras and of images of each model, preferably binary; empty without any.
+
+    COLMAP makes several models of pictures that it cannot join.
+    """
     for name in FOLDERS:
-        for ending in ("bin", "txt"):
-            paths = [folder / name / f"{part}.{ending}" for part in ("cameras", "images")]
-            if all(path.is_file() for path in paths):
-                return paths
+        place = folder / name.removesuffix("/*")
+        models = [place]
+        if name.endswith("*"):
+            models = by_number([path for path in list_folders(place) if path.name.isdecimal()])
+        found: list[Path] = []
+        for model in models:
+            for ending in ("bin", "txt"):
+                paths = [model / f"{part}.{ending}" for part in ("cameras", "images")]
+                if all(path.is_file() for path in paths):
+                    found += paths
+                    break
+        if found:
+            return found
     return []
+
+
+def choose_model(files: Sequence[Path], number: int | None) -> tuple[list[Path], tuple[str, ...]]:
+    """The files of one of several models, by default of the largest, and a note on the others."""
+    models = {own[0].parent.name: [*own] for own in zip(files[::2], files[1::2], strict=True)}
+    if number is not None and str(number) not in models:
+        raise InputError(
+            f"{files[0].parent.parent} has no model {number} (--model); it has {', '.join(models)}."
+        )
+    if len(models) == 1:
+        return [*files], ()
+    counts = {name: len(read_model(own)) for name, own in models.items()}
+    chosen = max(counts, key=lambda name: counts[name]) if number is None else str(number)
+    others = ", ".join(f"{name} with {count}" for name, count in counts.items() if name != chosen)
+    return models[chosen], (
+        f"of COLMAP's {len(models)} models, {chosen} with {counts[chosen]} frames is used, and not "
+        f"{others} (--model chooses)",
+    )
 
 
 def read_model(files: Sequence[Path]) -> list[PosedFrame]:
@@ -94,8 +128,10 @@ def read_model(files: Sequence[Path]) -> list[PosedFrame]:
     return sorted(made, key=lambda image: image.name)
 
 
-_Model = tuple[dict[int, dict[str, Any]], list[tuple[str, list[float], int]]]
-"""Keys of `Camera` by a camera's number; and name, pose and camera of each image."""
+_Image = tuple[str, list[float], int]
+"""Name, pose and number of the camera of an image."""
+_Model = tuple[dict[int, dict[str, Any]], list[_Image]]
+"""Keys of `Camera` by a camera's number; and the images."""
 
 
 def _camera(path: Path, model: str, size: tuple[int, int], values: list[float]) -> dict[str, Any]:
@@ -115,17 +151,42 @@ def _camera(path: Path, model: str, size: tuple[int, int], values: list[float]) 
 
 
 def _read_text(cameras: Path, images: Path) -> _Model:
-    lines, image_lines = (
-        [line for line in read_text(path).splitlines() if not line.startswith("#")]
-        for path in (cameras, images)
-    )
     known = {}
-    for words in (line.split() for line in lines if line.strip()):
-        values = [float(word) for word in words[4:]]
-        known[int(words[0])] = _camera(cameras, words[1], (int(words[2]), int(words[3])), values)
-    # Each image has a second line with its points, which may be empty.
-    rows = [line.split(maxsplit=9) for line in image_lines[::2] if line.strip()]
-    return known, [(row[9], [float(word) for word in row[1:8]], int(row[8])) for row in rows]
+    for _, line in _lines(cameras):
+        number, model, *rest = line.split()
+        values = [float(word) for word in rest[2:]]
+        known[int(number)] = _camera(cameras, model, (int(rest[0]), int(rest[1])), values)
+    return known, _image_rows(images)
+
+
+def _image_rows(path: Path) -> list[_Image]:
+    """Images of a text, whose second line has an image's points: x, y and a number of each.
+
+    Texts that are written by hand often lack that line, which may also be empty, so it is told by
+    its words: a multiple of three numbers. An image has ten words, or more if its name has spaces.
+    """
+    rows: list[_Image] = []
+    for number, line in _lines(path):
+        if rows and len(line.split()) % 3 == 0 and _NUMBERS.issuperset(line):
+            continue
+        try:
+            image, w, x, y, z, *position, camera, name = line.split(maxsplit=9)
+            _, (a, b, c) = int(image), position
+            rows.append((name, [*map(float, (w, x, y, z, a, b, c))], int(camera)))
+        except ValueError:
+            raise InputError(
+                f"{path}, line {number}: {shown(line)} is neither an image (its number, quaternion "
+                "w x y z, translation x y z, camera and name) nor the points of one (three numbers "
+                "each)."
+            ) from None
+    return rows
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Number and text of each line that is neither empty nor a comment."""
+    for number, line in enumerate(read_text(path).split("\n"), start=1):
+        if (line := line.strip()) and not line.startswith("#"):
+            yield number, line
 
 
 def _read_binary(cameras: Path, images: Path) -> _Model:
@@ -163,7 +224,12 @@ def polycam_files(folder: Path) -> list[Path]:
 def read_keyframes(paths: Sequence[Path]) -> Iterator[PosedFrame]:
     """Read Polycam's keyframes."""
     for path in paths:
-        read: Any = checked(_Keyframe, read_json(path), str(path))
+        data = read_json(path)
+        if isinstance(data, dict) and not data.keys() >= set(_SIZE):
+            original = path.parent.with_name("cameras") / path.name
+            other = read_json(original, hint=f"{path} has no size, which is read there")
+            data |= {key: other.get(key) for key in _SIZE} if isinstance(other, dict) else {}
+        read: Any = checked(_Keyframe, data, str(path))
         rows = [[getattr(read, key) for key in row] for row in _ENTRIES]
         pictures = path.parent.name.replace("cameras", "images")
         yield PosedFrame(

@@ -29,8 +29,8 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.files import list_files, read_json
 from sceneprior.core.id_tables import LARGEST_ID, mask_size, read_rgb, stuff_of, tidy
 
-FILES = ("*coco*.json", "instances*.json", "annotations*.json", "annotations/*.json")
-"""Glob patterns of COCO's JSON in a room's folder."""
+FILES = ("*coco*.json", "instances*.json", "annotations*.json")
+"""Glob patterns of COCO's JSON in a room's folder; it may also be in a folder `annotations`."""
 _BACKGROUND = "background"
 
 
@@ -146,7 +146,8 @@ class CocoMasks(MaskFormat):
 
     @classmethod
     def find(cls, folder: Path) -> list[Path]:
-        return sorted({path for pattern in FILES for path in list_files(folder, pattern)})
+        found = {path for pattern in FILES for path in list_files(folder, pattern)}
+        return sorted(found | {*list_files(folder / "annotations", "*.json")})
 
     @cached_property
     def _content(self) -> _Images | _Videos:

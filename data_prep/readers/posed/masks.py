@@ -2,16 +2,17 @@
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
-from data_prep.readers.frames import mask_intrinsics, sampled_lines
+from data_prep.readers.frames import mask_intrinsics, sampled_lines, turned_hint
 from data_prep.readers.posed.cameras import Lens, Straightened, straighten
-from data_prep.readers.posed.recording import PosedFrame, frame_intrinsics
+from data_prep.readers.posed.recording import INSTANCES, PosedFrame, as_png, frame_intrinsics
 from data_prep.tracks.associate import UNKNOWN, FrameMasks, associate
 from sceneprior.core.checked import plain, shown
 from sceneprior.core.classes import VOID, label_set
@@ -65,7 +66,7 @@ class SegmentedFrame:
     def put(self, frames: dict[str, FrameMask], file_name: str) -> None:
         """Add the frame to others by the stem of its picture's name, which must be unique."""
         check_size(self.size, self.where)
-        if (stem := Path(file_name).stem) in frames:
+        if (stem := Path(as_png(file_name)).stem) in frames:
             raise InputError(
                 f"{self.where}: two pictures are named {shown(stem)}; a room has one of each name."
             )
@@ -112,6 +113,10 @@ class MaskFormat(ABC):
         instead."""
         return f"a picture {shown(frame.stem)} in {self.find(self.folder)[0]}{instead(self.frames)}"
 
+    def unused(self, frames: Sequence[PosedFrame]) -> tuple[str, ...]:
+        """A note on masks of none of the frames; empty without such."""
+        return _without_frame(self.frames, {frame.stem for frame in frames})
+
     def classes(self) -> dict[int, str]:
         """Class of each id, if ids are the same in all frames."""
         classes, self.notes = main_classes(
@@ -124,7 +129,18 @@ class FramePngs(MaskFormat):
     """One PNG per frame: `PosedFrame.instances`."""
 
     def wanted(self, frame: PosedFrame) -> str:
-        return str(frame.instances)
+        return f"{frame.instances}{instead(self._pngs)}"
+
+    @cached_property
+    def _pngs(self) -> dict[str, Path]:
+        """PNGs by their names within the folder of PNGs."""
+        found, place = self.find(self.folder), self.folder / INSTANCES
+        pngs = [path for path in found if path.suffix == ".png" and place in path.parents]
+        return {path.relative_to(place).as_posix(): path.resolve() for path in pngs}
+
+    def unused(self, frames: Sequence[PosedFrame]) -> tuple[str, ...]:
+        used = {path.resolve() for f in frames for path in (f.instances, f.known) if path}
+        return _without_frame(self._pngs, {k for k, path in self._pngs.items() if path in used})
 
     def of(self, frame: PosedFrame) -> FrameMask | None:
         path = frame.instances
@@ -173,6 +189,13 @@ def instead(names: Iterable[str]) -> str:
     return f", but there is {_some(listed)}: give masks the names of their frames" if listed else ""
 
 
+def _without_frame(masks: Collection[str], used: Collection[str]) -> tuple[str, ...]:
+    if not (left := sorted(set(masks) - set(used))):
+        return ()
+    names = _some([plain(name) for name in left])
+    return (f"{len(left)} of {len(masks)} masks have no frame ('{names}'); unused",)
+
+
 def _some(words: list[str]) -> str:
     return ", ".join(words[:_LISTED]) + (", ..." if len(words) > _LISTED else "")
 
@@ -198,6 +221,8 @@ def read_tracked(
         listed = ", ".join(map(str, sorted(table.unlisted)[:20]))
         notes.append(f"masks show ids that the table of classes does not have ({listed}): void")
     frames_of = frames_of[1:-1]  # without the background and without masks of no class
+    if hidden := [str(table.objects[k]) for k in np.flatnonzero(frames_of == 0)]:
+        notes.append(f"{len(hidden)} of {len(frames_of)} ids show in no view ({_some(hidden)})")
     count, once = int((frames_of > 0).sum()), int((frames_of == 1).sum())
     if len(images) >= _MANY_FRAMES and count >= _MANY_IDS and once > _ONCE * count:
         raise InputError(
@@ -285,7 +310,8 @@ def _pixels(
         if values.shape != size:
             raise InputError(
                 f"the mask of frame {shown(frame.name)} is {values.shape[1]} x {values.shape[0]} "
-                f"pixels, but the first frame's {size[1]} x {size[0]}; a room has one size"
+                f"pixels, but the first frame's {size[1]} x {size[0]}; a room has one size."
+                + turned_hint(values.shape, size)
             )
         if frame.known is not None:
             known = read_mask(frame.known)

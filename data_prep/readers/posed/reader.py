@@ -67,6 +67,8 @@ class Posed(Reader):
     """Height of the lowest camera above the floor, assumed if the floor cannot be estimated."""
     metres_per_unit: float = 1.0
     """Scale in rooms whose file has none. Poses from pictures alone (COLMAP) have no unit."""
+    model: int | None = None
+    """Number of one of COLMAP's models; None takes the largest."""
     tracks: str = "given"
     """One of `TRACKS`: ids are `given` for all frames, or `auto` finds objects from masks whose ids
     have no meaning across frames."""
@@ -95,7 +97,9 @@ class Posed(Reader):
             )
         names = ("label_set", "up", "floor_m", "camera_height_m", "metres_per_unit", "max_side",
                  "tracks", "max_views")  # fmt: skip
-        formats = {"poses": self.poses, "masks": self.masks}
+        formats: dict[str, Any] = {"poses": self.poses, "masks": self.masks}
+        if self.model is not None:
+            formats["model"] = self.model
         return {"from": formats, **{name: getattr(self, name) for name in names}}
 
     def fingerprint(self, scenes: list[str]) -> dict[str, Any]:
@@ -133,6 +137,7 @@ class Posed(Reader):
             raise InputError(f"{self.folder} no longer has this room; restore its folder.")
         recording, masks = self.open(folders[task.house])
         of_frames = masks_of_frames(recording, masks)
+        unused = masks.unused(recording.frames)
         chosen, notes = choose_frames(
             str(recording.path),
             np.stack([frame.camera_to_world for frame in recording.frames]),
@@ -151,7 +156,7 @@ class Posed(Reader):
         except InputError as error:
             raise InputError(f"{recording.path}: {str(error).removesuffix('.')}.") from None
         return FramedRoom(
-            **made | {"notes": (*notes, *made["notes"])},
+            **made | {"notes": (*recording.notes, *notes, *unused, *made["notes"])},
             where=str(recording.path),
             camera_to_world=upright,
             may_err=True,
@@ -169,7 +174,7 @@ class Posed(Reader):
 
     def open(self, room: Path) -> tuple[Recording, MaskFormat]:
         """Poses and masks of a room's folder."""
-        recording = read_recording(room, self.poses)
+        recording = read_recording(room, self.poses, self.model)
         return recording, mask_format(room, self.masks)(room, self.label_set)
 
     def found(self) -> list[str]:
@@ -211,6 +216,11 @@ class Posed(Reader):
             sentences.append(
                 f"In {len(untracked)} {rooms} ids belong to single images ({untracked[0]}): "
                 "objects are found from poses, masks and classes, as with --tracks auto."
+            )
+        if several := [recording for recording in recordings if recording.notes]:
+            sentences.append(
+                f"In {len(several)} {rooms} a part of the poses is unused: in "
+                f"{several[0].folder.name}, {several[0].notes[0]}."
             )
         unknown = sum(recording.floor_m is None for recording in recordings)
         if unknown and self.floor_m is None:

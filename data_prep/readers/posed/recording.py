@@ -62,6 +62,8 @@ class Recording:
     floor_center_m: tuple[float, float] | None
     """Centre of the floor along the two horizontal axes in their order, metres."""
     metres_per_unit: float | None
+    notes: tuple[str, ...] = ()
+    """Sentences on what was not read."""
     up: str = "z"
     """Axis of the poses' world that points up; `cameras` if no axis does, as in COLMAP's worlds."""
 
@@ -72,7 +74,8 @@ class Recording:
 
 
 def path_text(name: str) -> str:
-    """Check that a file can have this name, and return it unchanged."""
+    """Check that a file can have this name, and return it with slashes for backslashes."""
+    name = name.replace("\\", "/")
     try:
         longest = max(map(len, name.encode().split(b"/")))
     except UnicodeEncodeError:
@@ -96,7 +99,8 @@ def ids_path(folder: Path, name: str) -> Path:
 
 
 def as_png(name: str) -> str:
-    path = Path(name)
+    """Name of a frame's PNG; programs on Windows write backslashes into names."""
+    path = Path(name.replace("\\", "/"))
     return f"{path.with_suffix('') if path.suffix.lower() in _PICTURES else path}.png"
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from data_prep.readers.posed.cameras import Camera, Number
-from data_prep.readers.posed.captures import TOOLS
+from data_prep.readers.posed.captures import TOOLS, choose_model
 from data_prep.readers.posed.recording import (
     INSTANCES,
     PosedFrame,
@@ -85,8 +85,11 @@ def pose_files(folder: Path, given: str | None = None) -> tuple[str, list[Path]]
     return next(iter(found.items()), ("nerfstudio", []))
 
 
-def read_recording(folder: Path, given: str | None = None) -> Recording:
-    """Read the frames of one room (`pose_files`); errors name the file, the frame and the key."""
+def read_recording(folder: Path, given: str | None = None, model: int | None = None) -> Recording:
+    """Read the frames of one room (`pose_files`); errors name the file, the frame and the key.
+
+    `model` is the number of one of COLMAP's models; None takes the largest.
+    """
     folder = Path(folder)
     name, files = pose_files(folder, given)
     if not files and name != "nerfstudio":
@@ -95,11 +98,15 @@ def read_recording(folder: Path, given: str | None = None) -> Recording:
     jsons = [(path, read_json(path)) for path in files if name == "nerfstudio"]
     rooms = jsons or [(path, read_json(path)) for path in files if path == folder / FILE_NAME]
     of_room = [(path, checked(_RoomEntry, data, str(path))) for path, data in rooms]
+    notes: tuple[str, ...] = ()
     if name == "nerfstudio":
         tool, frames = None, _frames(jsons)
     else:
         tool = TOOLS[name]
-        read = tool.read([path for path in files if path != folder / FILE_NAME])
+        files = [path for path in files if path != folder / FILE_NAME]
+        if name == "colmap":
+            files, notes = choose_model(files, model)
+        read = tool.read(files)
         frames = [frame._replace(instances=ids_path(folder, frame.name)) for frame in read]
     first: dict[Path, str] = {}
     for frame in frames:
@@ -120,6 +127,7 @@ def read_recording(folder: Path, given: str | None = None) -> Recording:
         _one("floor_m", of_room),
         _one("floor_center_m", of_room),
         metres_per_unit,
+        notes,
         "z" if tool is None else tool.up,
     )
 

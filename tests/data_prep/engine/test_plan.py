@@ -9,7 +9,7 @@ from front_jobs import digests, front_job, rooms_of, three_houses
 from refusals import refused
 
 from data_prep.engine.build import build_shards
-from data_prep.engine.plan import house_may_match, is_asked_for, seeded_split
+from data_prep.engine.plan import house_may_match, is_asked_for, read_splits, seeded_split
 
 
 def test_other_settings_want_another_folder(front, tmp_path):
@@ -114,7 +114,16 @@ def test_splits(front, tmp_path):
     text = "instanceid,split\nBedroom-0,train\nhouse0_MasterBedroom-0,test\nBedroom-1,val\n"
     assert split_sizes("a", f"{text}MasterBedroom-1,test\n") == [1, 1, 2]
     assert split_sizes("b", "Bedroom-0,train\n") == [1, 0, 0]  # enough to train on
-    for name, text in (("no train", "Bedroom-0,test\n"), ("no rows", "nothing\n")):
+    images = "scene_name,camera_name,frame_id,exclude_reason,split_partition_name\n"
+    rows = [
+        f"Bedroom-{k},cam_00,{n},,{('train', 'val', '')[k]}\n" for k in range(3) for n in (0, 1)
+    ]
+    path.write_text(f"\ufeff{images}{''.join(rows)}")
+    assert read_splits(path) == {"Bedroom-0": "train", "Bedroom-1": "val"}  # Hypersim's columns
+    for name, text in (
+        ("no train", "Bedroom-0,test\n"), ("no rows", "nothing\n"),
+        ("two splits", "Bedroom-0,train\nBedroom-0,x,test\n"),
+    ):  # fmt: skip
         with refused(f"engine/splits with {name}", tmp=tmp_path):
             split_sizes("e", text)
     assert not (tmp_path / "e").exists()  # nothing half-written
