@@ -114,12 +114,10 @@ def test_splits(front, tmp_path):
     text = "instanceid,split\nBedroom-0,train\nhouse0_MasterBedroom-0,test\nBedroom-1,val\n"
     assert split_sizes("a", f"{text}MasterBedroom-1,test\n") == [1, 1, 2]
     assert split_sizes("b", "Bedroom-0,train\n") == [1, 0, 0]  # enough to train on
-    images = "scene_name,camera_name,frame_id,exclude_reason,split_partition_name\n"
-    rows = [
-        f"Bedroom-{k},cam_00,{n},,{('train', 'val', '')[k]}\n" for k in range(3) for n in (0, 1)
-    ]
-    path.write_text(f"\ufeff{images}{''.join(rows)}")
-    assert read_splits(path) == {"Bedroom-0": "train", "Bedroom-1": "val"}  # Hypersim's columns
+    lines = [f"{at[0]},cam_00,{k},,{at[1:]}" for at in ("atrain", "bval", "c") for k in "01"]
+    header = "\ufeffscene_name,camera_name,frame_id,exclude_reason,split_partition_name"
+    path.write_text("\n".join([header, *lines]))
+    assert read_splits(path) == {"a": "train", "b": "val"}  # Hypersim's columns
     for name, text in (
         ("no train", "Bedroom-0,test\n"), ("no rows", "nothing\n"),
         ("two splits", "Bedroom-0,train\nBedroom-0,x,test\n"),

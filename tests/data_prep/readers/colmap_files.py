@@ -29,8 +29,11 @@ def colmap_poses(room: PosedRoom) -> Iterator[list[float]]:
         yield [float(value) for value in (w, x, y, z, *(-turn @ eye))]
 
 
-def write_colmap(room: PosedRoom, model: str, binary: bool, folder: str = "sparse/0") -> None:
-    """cameras and images of a model as COLMAP's documentation has them, in an odd order."""
+def write_colmap(
+    room: PosedRoom, model: str, binary: bool, folder: str = "sparse/0", most: int = 99
+) -> None:
+    """cameras and images of a model as COLMAP's documentation has them, in an odd order; `most` of
+    the views are in it."""
     room.write()
     (room.folder / "transforms.json").unlink()
     place = room.folder / folder
@@ -38,7 +41,7 @@ def write_colmap(room: PosedRoom, model: str, binary: bool, folder: str = "spars
     height, width = room.size
     number, form = PARAMETERS[model]
     text = form.format(f=room.focal_px, cx=width / 2, cy=height / 2)
-    views = list(enumerate(colmap_poses(room)))[::-1]
+    views = list(enumerate(colmap_poses(room)))[most::-1]
     names = [f"images/{room.stem(k)}.jpg" for k in range(len(room.poses))]
     if not binary:
         (place / "cameras.txt").write_text(f"# Camera list\n7 {model} {width} {height} {text}\n")

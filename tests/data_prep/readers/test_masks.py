@@ -42,6 +42,43 @@ def test_ids_of_single_images_are_joined_without_being_asked(room):
     assert said.endswith("objects are found from poses, masks and classes, as with --tracks auto.")
 
 
+WRITERS = {
+    "png": tools.write_plain,
+    "sam2": tools.write_sam2,
+    "grounded-sam2": tools.write_grounded_sam2,
+    "grounded-sam2, images": tools.write_grounded_sam2_images,
+    "coco": lambda room: tools.write_coco_images(room, "track_id"),
+    "coco, video": tools.write_coco_video,
+    "panoptic": tools.write_panoptic,
+}
+
+
+@pytest.mark.parametrize("tool", WRITERS)
+def test_masks_without_a_frame_and_names_of_windows(room, tool):
+    WRITERS[tool](room)
+    whole = prepared(room)
+    data = room.data
+    for path in [room.folder / "coco.json", *room.folder.glob("json_data/*.json")]:
+        if path.is_file():  # names of pictures in masks, too
+            path.write_text(path.read_text().replace("images/", r"C:\\rooms\\images\\"))
+    for frame in data["frames"]:
+        frame["file_path"] = "C:\\rooms\\" + frame["file_path"].replace("/", "\\")
+    room.write_transforms(data | {"floor_m": 0.0, "floor_center_m": [0.1, -0.2]})
+    made = prepared(room)
+    np.testing.assert_array_equal(made.views.instance_ids, whole.views.instance_ids)
+    assert made.notes == whole.notes
+    room.write_transforms(data | {"frames": data["frames"][3:]})
+    (note,) = (note for note in prepared(room).notes if "no frame" in note)
+    assert note.startswith("3 of 10 masks have no frame ('frame_00000")
+    assert note.endswith("); unused")
+
+
+def test_ids_that_no_mask_shows_are_counted(room):
+    table = {str(thing.id): thing.name for thing in room.things} | {"9": "bed", "12": "vase"}
+    (room.folder / "classes.json").write_text(json.dumps(table))
+    assert "2 of 5 ids show in no view (9, 12)" in prepared(room).notes
+
+
 def shuffle(room, unique):
     """Give each frame ids of its own, and write their classes as `unique` ids of the room, or in a
     JSON beside each PNG."""
@@ -124,6 +161,16 @@ def test_optimized_keyframes_of_polycam_are_preferred(room):
     assert {frame.camera.fl_x for frame in recording.frames} == {80.0}
     assert recording.metres_per_unit == 1.0 and recording.up == "y"
     assert recording.frames[0].name == f"keyframes/corrected_images/{tools.timestamp(0)}.jpg"
+    # Newer versions leave the size to the original cameras.
+    paths = sorted(room.folder.glob("keyframes/corrected_cameras/*.json"))
+    for path in paths:
+        data = json.loads(path.read_text())
+        path.write_text(json.dumps({k: data[k] for k in data if k not in ("width", "height")}))
+    again = read_recording(room.folder)
+    assert [frame.camera for frame in again.frames] == [frame.camera for frame in recording.frames]
+    (room.folder / "keyframes/cameras" / paths[2].name).unlink()
+    with refused("readers/polycam without a size", tmp=room.folder):
+        read_recording(room.folder)
 
 
 @pytest.mark.parametrize("name", ["metadata.json", "EXR_RGBD/metadata"])
@@ -145,6 +192,55 @@ def test_a_colmap_model_beside_transforms_is_taken_if_named(room, plain):
     np.testing.assert_array_equal(prepared(room).views.world_to_camera, plain.views.world_to_camera)
     assert read_recording(room.folder).up == "z"
     assert read_recording(room.folder, "colmap").up == "cameras"
+
+
+BLANK = "\n\n"
+TEXTS = {
+    "a line each": lambda lines: [line for line in lines if ".jpg" in line],
+    "points of each": lambda lines: [line or "1 2 -1 3 4 5 6 7 8" for line in lines],
+    "blank lines": lambda lines: ["# by hand", "", "", *lines, "", ""],
+    "blank lines between": lambda lines: [f"{line}{BLANK}" for line in lines],
+    "mark and carriage returns": lambda lines: ["\ufeff# a list", *(f"{line}\r" for line in lines)],
+    "indents and tabs": lambda lines: [" " + line.replace(" ", "\t") for line in lines],
+}
+
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_images_of_texts_of_colmap_in_any_layout(room, text):
+    write_colmap(room, "PINHOLE", binary=False)
+    before = read_recording(room.folder).frames
+    path = room.folder / "sparse/0/images.txt"
+    lines = TEXTS[text](path.read_text().split("\n"))
+    path.write_text("\n".join(lines), newline="")
+    after = read_recording(room.folder).frames
+    assert [frame.name for frame in after] == [frame.name for frame in before] and len(after) == 10
+    for one, other in zip(before, after, strict=True):
+        np.testing.assert_array_equal(one.camera_to_world, other.camera_to_world)
+    for k, line in enumerate(
+        ("1.5 2.5 -1 3.5", "1 1 0 0 0 0 0 0 7", "1.5 2.5 -1 3.5 4.5 7 8 9 10 11")
+    ):
+        path.write_text(f"# images\n\n{line}\n")
+        with refused(f"readers/line {k} of images.txt", tmp=room.folder):
+            read_recording(room.folder)
+
+
+def test_of_several_models_of_colmap_the_largest_is_taken_and_said(room, tmp_path, cli):
+    for number, most in ((0, 2), (1, 8), (10, 4)):
+        write_colmap(room, "PINHOLE", binary=number < 10, folder=f"sparse/{number}", most=most)
+    source = Posed(room.folder, classes=SET)
+    (said,) = (sentence for sentence in source.assumptions() if "COLMAP's 3 models" in sentence)
+    note = (
+        "of COLMAP's 3 models, 1 with 9 frames is used, and not 0 with 3, 10 with 5 (--model "
+        "chooses)"
+    )
+    assert said == f"In 1 of 1 rooms a part of the poses is unused: in attic, {note}."
+    made = prepared(room)
+    assert made.notes[:2] == (note, "1 of 10 masks have no frame ('frame_00009.png'); unused")
+    words = ("prep-posed", room.folder, "--label-set", SET, "--out", tmp_path / "a", "--workers", 1)
+    result = cli(*words, "--model", 0)
+    assert result.exit_code == 0 and "train 1 rooms, 3 views" in result.stdout, result.output
+    with refused("readers/model that is none", tmp=room.folder):
+        read_recording(room.folder, model=7)
 
 
 def test_what_was_found_is_said(room, cli, tmp_path):

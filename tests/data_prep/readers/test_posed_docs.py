@@ -10,6 +10,8 @@ from pages import ROOT, first_block, run_first_commands
 from PIL import Image
 from posed_files import PosedRoom, furniture
 
+from sceneprior.core.id_tables import read_mask
+
 DOCUMENT = ROOT / "docs" / "posed_data.md"
 
 
@@ -48,3 +50,16 @@ def test_every_key_that_is_read_is_in_the_document():
         assert spelt in text, word
     for name in id_tables.SHELL:
         assert f"`{name}`" in text
+
+
+def test_colours_become_ids_as_printed(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    colours = np.array([[(0, 0, 0), (255, 0, 3)], [(7, 7, 7), (255, 0, 3)]], dtype=np.uint8)
+    for name in ("coloured", "instances"):
+        Path(name).mkdir()
+    for k, picture in enumerate((colours, colours[::-1])):
+        Image.fromarray(picture).save(f"coloured/{k}.png")
+    code = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)[1]
+    exec(code, {"Path": Path, "Image": Image, "np": np})
+    one, other = (read_mask(Path(f"instances/{k}.png")) for k in (0, 1))
+    assert one.tolist() == other[::-1].tolist() == [[0, 2], [1, 2]]

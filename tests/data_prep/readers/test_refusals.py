@@ -125,6 +125,11 @@ POSED: dict[str, Damage] = {
     "list": text(POSES, "[1, 2]"),
     "bytes": text(POSES, b"\xff\xfe"),
     "mask of another size": image(PNG, np.zeros((96, 127))),
+    "mask turned": image(PNG, np.zeros((128, 96))),
+    "masks turned": lambda folder: [
+        image(str(path.relative_to(folder)), np.zeros((128, 96)))(folder)
+        for path in folder.glob("attic/instances/*.png")
+    ],
     "coloured ids": image(PNG, np.zeros((96, 128, 3))),
     "damaged PNG": cut(PNG, 60),
     "masks that are missing": lambda folder: shutil.rmtree(folder / "attic/instances"),
@@ -230,6 +235,7 @@ OTHERS: dict[str, dict[str, Damage]] = {
         "unknown image": annotation(image_id=99),
         "unknown category": annotation(category_id=99),
         "no mask": annotation(segmentation=None),
+        "boxes": annotation(segmentation=[]),
         "huge image": edit(COCO, lambda data: data["images"][0].update(height=10**6, width=10**6)),
         "image of another size": edit(COCO, lambda data: data["images"][0].update(height=97)),
         "no images": keys(COCO, images=None),
