@@ -46,6 +46,8 @@ LEAN_RAD = math.radians(40)
 """Tilt of the board, about the elevation of the page's initial camera."""
 _BOX, _KEPT = (120, 120, 120), (230, 120, 20)
 _BOARD, _DOT, _PATH, _HERE = (244, 243, 238), (70, 92, 140), (214, 110, 30), (200, 30, 60)
+WORKER = "sceneprior page"
+"""Name of the thread that draws rooms."""
 Point = tuple[float, float]
 """A point of the map."""
 
@@ -74,10 +76,10 @@ class Page:
         """The displayed scene: the scene of `shown`, with CAD models if they are chosen."""
         self.on_show: Callable[[], None] = lambda: None
         """Called after each change of the shown room."""
-        # Callbacks come from many threads, and a callback may trigger another in its own thread.
         self._lock = threading.RLock()
         self._newest: Callable[[], None] | None = None
-        self._follower = ThreadPoolExecutor(1)
+        # Callbacks come from 32 threads of viser's; each that drew rooms would keep memory for it.
+        self._worker = ThreadPoolExecutor(1, WORKER)
         self._nodes: dict[str, Any] = {}
         self._bounds_m = np.zeros((2, 3))
         """Lowest and highest corner that the cameras show."""
@@ -207,10 +209,14 @@ class Page:
                 self.safely(newest)
 
         self._newest = task
-        self._follower.submit(do_newest)
+        self._worker.submit(do_newest)
 
     def safely(self, task: Callable[[], None]) -> None:
-        """Run a browser's request under the lock; errors are shown as notifications."""
+        """Run a browser's request in the page's thread, and wait for it; errors are shown as
+        notifications."""
+        if not threading.current_thread().name.startswith(WORKER):  # a callback may trigger another
+            self._worker.submit(self.safely, task).result()
+            return
         try:
             with self._lock:
                 task()

@@ -146,7 +146,7 @@ def _extents_of(
     first, last = ends[:, 0] * cells // LEVELS, -(-ends[:, 1] * cells // LEVELS)
     block = hull[tuple(itertools.starmap(slice, zip(first, last, strict=True)))]
     # Asked thousands of times for a prototype: `argwhere` would take three times as long.
-    found = [block.any(axis=others).nonzero()[0] for others in ((1, 2), (0, 2), (0, 1))]
+    found = [np.flatnonzero(block.any(axis=others)) for others in ((1, 2), (0, 2), (0, 1))]
     if not len(found[0]):
         return ends
     low = (first + [each[0] for each in found]) * LEVELS // cells

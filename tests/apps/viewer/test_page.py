@@ -2,7 +2,9 @@
 
 import io
 import json
+import threading
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
@@ -140,6 +142,21 @@ def test_values_that_the_page_does_not_offer_are_refused(prior, source, capfd):
                 answered = said[-1][1]
     assert answered.startswith("'' is not offered here; choose from GLB, JSON")
     assert tried > 5 and capfd.readouterr() == ("", "")
+
+
+def test_rooms_are_drawn_in_one_thread():
+    """Each thread that draws rooms keeps megabytes, and the server answers from 32."""
+    threads = set()
+    with serving("127.0.0.1", 0) as server, ThreadPoolExecutor(8) as pool:
+        page = open_page(server, Folder([ROOM]), "mine").page
+
+        def task() -> None:
+            page.safely(lambda: threads.add(threading.get_ident()))  # one in the other
+
+        for _ in range(40):
+            pool.submit(page.safely, task)
+            page.follow(task)
+    assert len(threads) == 1
 
 
 class FakeScene:
