@@ -21,7 +21,7 @@ from data_prep.readers.annotations import download
 from sceneprior.core.cameras import to_camera
 from sceneprior.core.checked import checked, plain, shown
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import cause_of, check_file, read_bytes, read_json
+from sceneprior.core.files import check_file, read_bytes, read_json, reading
 from sceneprior.core.id_tables import png_kind
 from sceneprior.core.scene import Mesh
 
@@ -64,12 +64,9 @@ def read_sens(path: Path) -> SensRecording:
     Source: ScanNet's SensReader (sensorData.h), version 4.
     """
     size = check_file(path, sys.maxsize, "a scan folder holds it as <scene>.sens").st_size
-    try:
-        # The file is unbuffered, because a buffer would read 100 KB around every header.
-        with path.open("rb", buffering=0) as file:
-            return _read(_Part(path, file, size))
-    except OSError as error:
-        raise InputError(f"{path} cannot be read ({cause_of(error)}).") from None
+    # The file is unbuffered, because a buffer would read 100 KB around every header.
+    with reading(path), path.open("rb", buffering=0) as file:
+        return _read(_Part(path, file, size))
 
 
 @dataclass
@@ -158,12 +155,8 @@ def _read(part: _Part) -> SensRecording:
 def open_masks(path: Path) -> Iterator["MaskArchive"]:
     """Open a zip of masks."""
     check_file(path, sys.maxsize, "download it again")
-    try:
+    with reading(path, " cannot be opened as a zip", "; download it again."):
         archive = zipfile.ZipFile(path)
-    except _DAMAGE as error:
-        raise InputError(
-            f"{path} cannot be opened as a zip ({error}); download it again."
-        ) from None
     with archive:
         yield MaskArchive(path, archive)
 
@@ -336,16 +329,12 @@ def read_mesh(path: Path) -> Mesh:
     from trimesh.exchange.ply import load_ply
 
     content = io.BytesIO(read_bytes(path, hint=download(path)))
-    try:
+    then = "; it is truncated or damaged. Download the scan again."
+    with reading(path, " is not a mesh that can be read", then):
         # Load raw arrays, not a Trimesh, which may merge or drop vertices: segments index them.
         loaded = load_ply(content, fix_texture=False, skip_materials=True)
         vertices = np.array(loaded["vertices"], dtype=np.float64).reshape(-1, 3)
         faces = np.array(loaded.get("faces", ()), dtype=np.int64).reshape(-1, 3)
-    except Exception as error:  # trimesh raises many types for damaged files
-        raise InputError(
-            f"{path} is not a mesh that can be read ({type(error).__name__}: {error}); "
-            "it is truncated or damaged. Download the scan again."
-        ) from None
     if not len(vertices) or not np.isfinite(vertices).all():
         raise InputError(f"{path} holds no vertices, or broken ones. Download the scan again.")
     if faces.size and not (faces.min() >= 0 and faces.max() < len(vertices)):
