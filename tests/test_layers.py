@@ -40,7 +40,7 @@ MAY_TOO = {
 }
 
 BUDGET = {
-    "data_prep": (12589, 59),
+    "data_prep": (12578, 59),
     "sceneprior/core": (5647, 28),
     "sceneprior/furniture": (588, 4),
     "sceneprior/render": (4490, 23),
