@@ -80,11 +80,10 @@ def main() -> None:
     unmet = Counter(
         each["wish"] for room in rooms for each in room.extra["wishes"] if not each["holds"]
     )
-    total = sum(len(r["want"]) - 1 + len(r["want"]["relations"]) for r in requests)
     relations = Counter(each["relation"] for r in requests for each in r["want"]["relations"])
     plain = prior.sample(len(rooms), seed=arguments.seed)
     result = {
-        "requests": len(requests), "refused": refused, "wishes": total, "met": sum(held),
+        "requests": len(requests), "refused": refused, "wishes": len(held), "met": sum(held),
         "relations": dict(relations),
         "unmet": dict(unmet), "seconds": round(seconds, 3),
         "classifier": accuracy(rooms, real, test, arguments.seed),

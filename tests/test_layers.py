@@ -41,16 +41,16 @@ MAY_TOO = {
 
 BUDGET = {
     "data_prep": (12578, 59),
-    "sceneprior/core": (5647, 28),
+    "sceneprior/core": (5654, 28),
     "sceneprior/furniture": (588, 4),
     "sceneprior/render": (4490, 23),
     "sceneprior/training": (864, 5),
     "sceneprior/paper": (2405, 12),
-    "sceneprior/lifted": (7919, 39),
+    "sceneprior/lifted": (8174, 41),
     "sceneprior/baselines": (2909, 14),
     "sceneprior/evaluation": (4466, 21),
     "sceneprior/interchange": (892, 5),
-    "sceneprior/apps": (6226, 34),
+    "sceneprior/apps": (6248, 34),
 }
 """Most lines and modules of a folder. They go down freely, and up only in a commit that says what
 it bought and what went for it."""

@@ -1,8 +1,8 @@
 """The Python API, used by the commands: load a trained prior and generate rooms with it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -122,7 +122,7 @@ class Prior:
                 (docs/uses.md); given objects with a mesh keep it.
 
         Requests need a prior with a sampler; see docs/requests.md. `extra["wishes"]` of a room
-        lists each wish, and whether the room fulfils it.
+        lists each wish, the floor, openings and ceiling, and whether they hold.
 
         Raises:
             InputError: the prior has no such distribution, or no room can satisfy the request.
@@ -142,9 +142,9 @@ class Prior:
             "floor": floor, "openings": openings, "ceiling_m": ceiling_m, "want": want,
             "objects": objects,
         }  # fmt: skip
-        rooms = sample_rooms(self.trained, count, seed, distribution, request_of(asked))
-        rooms = self._told(rooms, seed=seed, distribution=distribution or self.distribution)
-        return _with_models(rooms, objects or ()) if cad else rooms
+        models, request = _models(objects or ()) if cad else None, request_of(asked)
+        rooms = sample_rooms(self.trained, count, seed, distribution, request, with_models=models)
+        return self._told(rooms, seed=seed, distribution=distribution or self.distribution)
 
     def interpolate(self, start: Point, end: Point, steps: int = 9) -> list[Scene]:
         """Rooms on the geodesic between two latents, both ends included.
@@ -214,9 +214,9 @@ class Prior:
             own |= {"floor": scene.floor_m, "openings": scene.openings or None}
             own |= {"ceiling_m": scene.ceiling_m}
         request = request_of({**own, **asked})
-        rooms = sample_rooms(self.trained, count, seed, None, request, True, classes)
-        rooms = self._told(rooms, seed=seed)
-        return _with_models(rooms, scene.objects) if cad else rooms
+        models = _models(scene.objects) if cad else None
+        rooms = sample_rooms(self.trained, count, seed, None, request, True, classes, models)
+        return self._told(rooms, seed=seed)
 
     def reconstruct(
         self, images: Sequence[ObservedImage], fit: str = "objects", restarts: int = 1
@@ -273,7 +273,7 @@ class Prior:
         return with_latents(self.trained, self.where)
 
 
-def _with_models(rooms: list[Scene], given: Sequence[SceneObject]) -> list[Scene]:
+def _models(given: Sequence[SceneObject]) -> Callable[[list[Scene]], list[Scene]]:
     from sceneprior.apps.retrieval.retrieve import with_models
 
-    return with_models(rooms, given)
+    return partial(with_models, given=given)

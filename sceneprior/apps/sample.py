@@ -1,7 +1,7 @@
 """New rooms from a run of any method, and requests for them: arguments, JSON, and floors in other
 files."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ def sample_rooms(
     request: RoomRequest | None = None,
     completes: bool = False,
     classes: Sequence[str] | None = None,
+    with_models: Callable[[list[Scene]], list[Scene]] | None = None,
 ) -> list[Scene]:
     """Sample new rooms from a run of any method, by its sampler or a distribution of latents.
 
@@ -37,7 +38,7 @@ def sample_rooms(
         request: What the rooms must meet; only a sampler can.
         completes: Complete the room of the request, whose floor stays where it is, by the run's
             sampler, whatever its default.
-        classes: See `sample_scenes`.
+        classes, with_models: See `sample_scenes`.
 
     Raises:
         InputError: the run cannot draw such rooms.
@@ -59,7 +60,7 @@ def sample_rooms(
                 "This run has no sampler, or its stage has not begun; leave out --distribution "
                 f"{SAMPLER}, or train with a section `sampler` (`--config lifted/bedroom.yaml`)."
             )
-        return sample_scenes(trained, names, seed, request, classes, floor_stays=completes)
+        return sample_scenes(trained, names, seed, request, classes, completes, with_models)
     if request is not None or classes is not None:
         others = "these rooms come from latents"
         if not isinstance(trained, TrainedPrior):
@@ -70,14 +71,16 @@ def sample_rooms(
         )
     if isinstance(trained, TrainedPrior):
         z = draw_latents(trained, count, seed, distribution)
-        return decode_latents(trained, z, names)
+        found = decode_latents(trained, z, names)
+        return found if with_models is None else with_models(found)
     if distribution is not None:
         raise InputError(
             f"--distribution {distribution} chooses a distribution of latents, but `method: "
             f"{trained.config.method}` has no latents; leave the option out."
         )
     rooms = trained.prior.sample(count, seed)
-    return boxes_to_scenes(rooms, trained.config.label_set, names)
+    found = boxes_to_scenes(rooms, trained.config.label_set, names)
+    return found if with_models is None else with_models(found)
 
 
 def boxes_to_scenes(rooms: RoomBoxes, label_set_name: str, names: Sequence[str]) -> list[Scene]:

@@ -10,7 +10,16 @@ from sceneprior.core.errors import InputError
 
 _M = TypeVar("_M", bound=BaseModel)
 _LONGEST = 60
-_REPR = reprlib.Repr()
+
+
+class _Repr(reprlib.Repr):
+    """Short representations, also of integers that Python does not convert to text."""
+
+    def repr_int(self, x: int, level: int) -> str:
+        return "a number of many digits" if abs(x) >= 10**_LONGEST else super().repr_int(x, level)
+
+
+_REPR = _Repr()
 _REPR.maxstring = _LONGEST
 
 
@@ -55,8 +64,6 @@ def shown(value: Any) -> str:
     >>> shown({"a": [1, 2]}), len(shown("x" * 10_000)), shown(10**5000)
     ("{'a': [1, 2]}", 62, 'a number of many digits')
     """
-    if isinstance(value, int) and abs(value) >= 10**_LONGEST:
-        return "a number of many digits"
     return f"'{plain(value)}'" if isinstance(value, str) else plain(_REPR.repr(value))
 
 

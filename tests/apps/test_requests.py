@@ -44,7 +44,7 @@ def test_a_file_asks_what_its_keys_say(prior, tmp_path):
         "double_bed", (0.0, 0.3, -0.4), (1.8, 0.6, 2.0),
     )  # fmt: skip
     assert bed.mesh is not None and room.extra["given"] == [0]
-    assert all(each["holds"] for each in room.extra["wishes"]) and len(room.extra["wishes"]) == 2
+    assert all(each["holds"] for each in room.extra["wishes"]) and len(room.extra["wishes"]) == 5
     assert room.ceiling_m == 2.6 and room.openings[0].start_m[1] == pytest.approx(1.5)
     assert "want" in RequestFile.model_json_schema()["properties"]
 
@@ -118,5 +118,5 @@ def test_the_file_of_the_guide_is_a_request(prior, tmp_path):
     (block,) = re.findall(r"```json\n(.*?)```", page, flags=re.S)
     (tmp_path / "request.json").write_text(block)
     (room,) = prior.sample(1, seed=0, **load_request(tmp_path / "request.json"))
-    assert [each["holds"] for each in room.extra["wishes"]] == [True] * 3
+    assert [each["holds"] for each in room.extra["wishes"]] == [True] * 7
     assert [each.kind for each in room.openings] == ["window", "door"]

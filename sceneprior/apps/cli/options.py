@@ -123,10 +123,13 @@ def rooms_in_words(count: int) -> str:
 
 
 def note_unmet(scenes: Sequence["Scene"]) -> None:
-    """Print the wishes that each room does not fulfil, or that all wishes hold."""
+    """Print how many wishes hold, and those that each room does not fulfil."""
     wishes = [each for room in scenes for each in room.extra.get("wishes", [])]
-    if wishes and all(each["holds"] for each in wishes):
-        typer.echo(f"All wishes hold in {rooms_in_words(len(scenes))}")
+    held = sum(each["holds"] for each in wishes)
+    if wishes:
+        checked = ", ".join(dict.fromkeys(each["wish"] for each in wishes))
+        start = "All wishes" if held == len(wishes) else f"{held} of {len(wishes)} wishes"
+        typer.echo(f"{start} hold in {rooms_in_words(len(scenes))}: {checked}")
     for room in scenes:
         unmet = [each["wish"] for each in room.extra.get("wishes", []) if not each["holds"]]
         if unmet:

@@ -24,6 +24,7 @@ from sceneprior.apps.retrieval.cad_models import CadModels, ClassModels, made_mo
 from sceneprior.core.boxes import QUARTERS, quarter_rotation
 from sceneprior.core.scene import Mesh, Scene, SceneObject, quarter_turned
 from sceneprior.core.surfaces import chamfer_mean, surface_points
+from sceneprior.lifted.requests.wishes import BY_FRONT
 from sceneprior.render.appearance import box_mesh
 
 STANDS_M = 1.0
@@ -56,7 +57,8 @@ class Retrieved(NamedTuple):
 def retrieve(scene: Scene, models: CadModels, keep: Collection[int] = ()) -> Scene:
     """Replace every object's mesh and materials by those of the most similar CAD model.
 
-    The model's turn becomes the object's yaw (`SceneObject.turned`). `extra["retrieval"]` holds
+    The model's turn becomes the object's yaw (`SceneObject.turned`). Models keep the known yaws of
+    a room that fulfils wishes about fronts, such as "chair facing desk". `extra["retrieval"]` holds
     {"model_id", "turn_deg", "distance_m"} for each object, in the order of the objects. The entry
     is None for a class without models; such an object keeps its mesh, extruded together with its
     box.
@@ -66,10 +68,11 @@ def retrieve(scene: Scene, models: CadModels, keep: Collection[int] = ()) -> Sce
     """
     objects: list[SceneObject] = []
     found: list[dict[str, object] | None] = []
+    strict = _asks_for_fronts(scene)
     for row, item in enumerate(scene.objects):
         box, told = item if row in keep else extruded(item), None
         if row not in keep and (of_class := models.of_class(item.label)):
-            best = most_similar(box, of_class)
+            best = most_similar(box, of_class, strict)
             mesh = placed(models.load(best.model_id), box, best.turn_deg)
             textured = tuple(
                 part._replace(mesh=placed(part.mesh, box, best.turn_deg))
@@ -152,11 +155,22 @@ def placed(unit: Mesh, item: SceneObject, turn_deg: int) -> Mesh:
     return Mesh(turned * np.asarray(item.size_m) + np.asarray(item.center_m), unit.faces)
 
 
-def most_similar(item: SceneObject, models: ClassModels) -> Retrieved:
+def _asks_for_fronts(scene: Scene) -> bool:
+    """True if a wish in `extra` that holds is about the front of an object."""
+    wishes = scene.extra.get("wishes")
+    return isinstance(wishes, list) and any(  # a file may hold anything
+        f" {relation} " in str(each.get("wish"))
+        for each in wishes
+        if isinstance(each, dict) and each.get("holds") is True
+        for relation in BY_FRONT
+    )
+
+
+def most_similar(item: SceneObject, models: ClassModels, strict: bool = False) -> Retrieved:
     """The model and turn of a class that are nearest to an object by Chamfer distance.
 
     If the object's yaw is known and a quarter turn, the distances of models at other turns are
-    multiplied by `OTHER_TURN`.
+    multiplied by `OTHER_TURN`; if `strict`, these models are left out.
     """
     # Turning the object back by each quarter turn, instead of turning the models, gives the same
     # distances, and the models' points are used as stored.
@@ -164,7 +178,10 @@ def most_similar(item: SceneObject, models: ClassModels) -> Retrieved:
     back = [quarter_rotation(quarters).T for quarters in range(QUARTERS)]
     size_m = np.asarray(item.size_m, dtype=np.float64)
     views = [(at_center @ turn.T, np.abs(turn @ size_m)) for turn in back]
+    known = _known_turn(item, 0.0 if strict else SURE)
     choices = np.arange(len(models.model_ids) * QUARTERS)
+    if strict and known is not None:
+        choices = choices[choices % QUARTERS == known]
     for step, share in ROUNDS:
         going_on = max(KEEP, int(len(choices) * share) if share else 0)
         if going_on < len(choices):
@@ -177,16 +194,15 @@ def most_similar(item: SceneObject, models: ClassModels) -> Retrieved:
         model, turn = divmod(int(choice), QUARTERS)
         points, size = views[turn]
         distances.append(chamfer_mean(points, models.points[model] * size, trees[turn]))
-    known = _known_turn(item)
     other = known is not None and choices % QUARTERS != known
     best = int(np.argmin(np.where(other, OTHER_TURN, 1.0) * distances))
     model, turn = divmod(int(choices[best]), QUARTERS)
     return Retrieved(models.model_ids[model], 90 * turn, distances[best])
 
 
-def _known_turn(item: SceneObject) -> int | None:
-    """An object's yaw in quarter turns; None if the yaw is unknown or no quarter turn."""
-    if item.turned is None or item.turned.confidence < SURE:
+def _known_turn(item: SceneObject, sure: float) -> int | None:
+    """An object's yaw in quarter turns; None if the yaw is less than `sure`, or no quarter turn."""
+    if item.turned is None or item.turned.confidence < sure:
         return None
     quarters = item.turned.yaw_rad / (np.pi / 2)
     return round(quarters) % QUARTERS if abs(quarters - round(quarters)) < 1e-3 else None

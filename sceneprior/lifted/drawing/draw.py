@@ -2,7 +2,7 @@
 until they are whole. A plain room has no wishes and one particle."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -21,8 +21,9 @@ from sceneprior.lifted.drawing.steps import NUMBERS, Particles, Rejections, plac
 from sceneprior.lifted.lifting import HANGS_M
 from sceneprior.lifted.prototype_decoder import PrototypeDecoder
 from sceneprior.lifted.prototypes import POSES, PosedRooms
+from sceneprior.lifted.requests.checks import answers
 from sceneprior.lifted.requests.floors import RoomShape
-from sceneprior.lifted.requests.relations import RelationChecks, furniture_in
+from sceneprior.lifted.requests.relations import furniture_in
 from sceneprior.lifted.requests.request import RoomRequest
 from sceneprior.lifted.requests.rules import PlacementRules
 from sceneprior.lifted.requests.wishes import Conditions
@@ -218,6 +219,7 @@ def sample_scenes(
     request: RoomRequest | None,
     classes: Sequence[str] | None,
     floor_stays: bool,
+    with_models: Callable[[list[Scene]], list[Scene]] | None = None,
 ) -> list[Scene]:
     """Sample a room with meshes for each name; see `draw_rooms`.
 
@@ -228,6 +230,7 @@ def sample_scenes(
         classes: Classes of the objects to add to the given ones, and no others; instead of wishes.
             `extra["no_place"]` lists those for which no place was found.
         floor_stays: Never move the floor; otherwise, a floor without given objects is centred.
+        with_models: Replaces meshes by models; wishes are checked after it.
 
     Raises:
         InputError: the prior does not understand the request, or no room meets it.
@@ -246,7 +249,9 @@ def sample_scenes(
     conditions, told = Conditions(tuple(label_names)), dict[str, Any]()
     if request is not None:
         labels, most = trained.config.label_set, sampler.max_objects
-        conditions = request.conditions(known, labels, most, floor_stays)
+        meets = sampler.may_meet.nonzero().tolist()
+        may_meet = {frozenset(label_names[index] for index in pair) for pair in meets}
+        conditions = request.conditions(known, labels, most, floor_stays, may_meet)
         told = {key: part for key, part in request.parts().items() if key != "objects"}
     drawn = draw_rooms(sampler, conditions, len(names), seed, may_lack=classes is not None)
     scenes = []
@@ -255,36 +260,41 @@ def sample_scenes(
         if classes is not None:
             extra["no_place"] = sorted(label_names[index] for index in drawn.missing[row])
         elif told:
-            extra = {"request": told, "wishes": _wishes(sampler, conditions, drawn, row)}
+            extra = {"request": told, "wishes": []}
         if conditions.objects:
             extra["given"] = list(range(len(conditions.objects)))
-        scenes.append(replace(_scene_of(trained, name, conditions, drawn, row), extra=extra))
-    return scenes
+        turns_given = with_models is not None
+        scene = _scene_of(trained, name, conditions, drawn, row, turns_given)
+        scenes.append(_answered(replace(scene, extra=extra), sampler, conditions, drawn, row))
+    if with_models is None:
+        return scenes
+    rooms = enumerate(with_models(scenes))
+    return [_answered(room, sampler, conditions, drawn, row) for row, room in rooms]
 
 
-def _wishes(
-    sampler: RoomSampler, conditions: Conditions, drawn: SampledRooms, row: int
-) -> list[dict[str, Any]]:
-    """Each wish, and whether it holds in a room."""
-    furniture, wishes = furniture_in(sampler, drawn.rooms, row), conditions.wishes
-    counts = Counter(conditions.classes[index] for index in furniture.object_class)
-    held = [wish.holds(counts[wish.label]) for wish in wishes.counts]
-    if (shape := drawn.shapes[row]) is not None:
-        held += RelationChecks(wishes.relations, shape, conditions.classes).held(furniture)
-    return [
-        {"wish": str(wish), "holds": holds}
-        for wish, holds in zip((*wishes.counts, *wishes.relations), held, strict=True)
-    ]
+def _answered(
+    scene: Scene, sampler: RoomSampler, conditions: Conditions, drawn: SampledRooms, row: int
+) -> Scene:
+    """A requested room with the answers to its wishes, if it has any."""
+    if "wishes" not in scene.extra:
+        return scene
+    found = answers(scene, conditions, furniture_in(sampler, drawn.rooms, row).front)
+    return replace(scene, extra={**scene.extra, "wishes": found})
 
 
 def _scene_of(
-    trained: TrainedLifted, name: str, conditions: Conditions, drawn: SampledRooms, row: int
+    trained: TrainedLifted,
+    name: str,
+    conditions: Conditions,
+    drawn: SampledRooms,
+    row: int,
+    turns_given: bool,
 ) -> Scene:
     """Convert a sampled room to a scene with meshes; its floor is the room's rectangle, unless the
     request has another.
 
-    Yaws of objects are those of the fronts of their looks (`orient`). Given objects stay as
-    they are; those without a mesh get that of their look.
+    Yaws of objects are those of the fronts of their looks (`orient`). Given objects stay as they
+    are; those without a mesh get that of their look and, if `turns_given`, its yaw.
     """
     sampler, shapes, rooms = trained.sampler, trained.prior.shape, drawn.rooms
     assert isinstance(shapes, PrototypeDecoder), "whose looks the sampler draws"
@@ -300,15 +310,18 @@ def _scene_of(
         if box[1] - box[4] / 2 < HANGS_M:
             box[1] = box[4] / 2  # lifted boxes end a little above the floor
         mesh, solids = _shape_in(shapes, look, box) if known else (None, ())
-        if item < len(conditions.objects):
-            own = conditions.objects[item]
-            objects.append(replace(own, mesh=mesh, solids=solids) if own.mesh is None else own)
-            continue
         center, size = tuple(box[:3]), tuple(box[3:])
         # A front at high z, high x, low z or low x is turned by 0, 1, 2 or 3 quarters.
         turned = quarter_turned(size, int(fronts[item]) + 2)._replace(
             confidence=float(confidence[item])
         )
+        if item < len(conditions.objects):
+            own = conditions.objects[item]
+            if own.mesh is None:
+                yaw = own.turned or (turned if turns_given else None)
+                own = replace(own, mesh=mesh, solids=solids, turned=yaw)
+            objects.append(own)
+            continue
         objects.append(SceneObject(conditions.classes[index], center, size, mesh, turned, solids))
     if (shape := drawn.shapes[row]) is None:
         middle, extents = rooms.rectangle_m[row].double().numpy().reshape(2, 2)

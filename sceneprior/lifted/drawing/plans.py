@@ -15,6 +15,7 @@ from sceneprior.core.errors import InputError, InputWarning
 from sceneprior.core.mixtures import draw_index
 from sceneprior.core.shell import rectangle
 from sceneprior.lifted.prototypes import PosedRooms
+from sceneprior.lifted.requests.checks import fronts_of
 from sceneprior.lifted.requests.floors import Floor, RoomShape
 from sceneprior.lifted.requests.openings import place_openings
 from sceneprior.lifted.requests.wishes import Conditions
@@ -59,6 +60,8 @@ class RoomPlans(NamedTuple):
     ceiling_m: float | None
     hangs: Bool[Tensor, " classes"]
     """True for classes that hang from a ceiling of known height."""
+    given_front: Float[np.ndarray, "given 2"]
+    """Fronts (x, z) of given objects with a yaw; NaN for others, whose looks say their fronts."""
 
     def take(self, rows: Int[Tensor, " some"]) -> "RoomPlans":
         """The plans of these rooms."""
@@ -66,6 +69,7 @@ class RoomPlans(NamedTuple):
             self.rooms.changed(lambda part: part[rows]), self.rectangle_m[rows],
             self.pieces_m[rows], self.upcoming[rows], self.required[rows],
             [self.shapes[row] for row in rows.tolist()], self.ceiling_m, self.hangs,
+            self.given_front,
         )  # fmt: skip
 
 
@@ -125,8 +129,9 @@ def plan_rooms(
         rooms = _with_looks(sampler, rooms, rectangle_m, upcoming, draws)
     hangs = torch.tensor([label in HUNG for label in conditions.classes])
     return RoomPlans(
-        rooms, rectangle_m, pieces_m, upcoming, is_required, shapes, conditions.ceiling_m, hangs
-    )
+        rooms, rectangle_m, pieces_m, upcoming, is_required, shapes, conditions.ceiling_m, hangs,
+        fronts_of(conditions.objects),
+    )  # fmt: skip
 
 
 def _given(conditions: Conditions, slots: int) -> PosedRooms:

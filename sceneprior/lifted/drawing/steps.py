@@ -75,10 +75,14 @@ class Particles:
                 rooms.boxes_m, rooms.object_class, self.looks
             )),
         )  # fmt: skip
-        return [
+        found = [
             every.rows(slice(row * most, row * most + number))
             for row, number in enumerate(self.number.tolist())
         ]
+        own = self.plans.given_front
+        for each in found:
+            each.front[: len(own)] = np.where(np.isnan(own), each.front[: len(own)], own)
+        return found
 
     def place(
         self,

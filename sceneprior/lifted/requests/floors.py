@@ -1,7 +1,6 @@
 """The floor of a requested room: its outline as users give it, and the rectangles in it."""
 
 import re
-from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -91,7 +90,7 @@ class RoomShape(NamedTuple):
         return self.floor.walls[nearest_wall(self.floor.walls, middle)].inward
 
 
-def read_floor(floor: str | Sequence[Any] | np.ndarray) -> np.ndarray:
+def read_floor(floor: Any) -> np.ndarray:
     """Outline (corners, 2) of a floor, from `4x3` (metres along x and z, centred at the origin) or
     from a list of corners x, z in order, as numbers or text (`0,0 4,0 4,3`).
 

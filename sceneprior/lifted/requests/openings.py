@@ -58,6 +58,10 @@ class WantedOpening:
     """Distance of the middle from the wall's first end, which is the western or northern end for a
     wall of `COMPASS`."""
 
+    def __str__(self) -> str:
+        side = "" if self.wall is None else f"@{self.wall}"
+        return f"{self.kind}{side}" + ("" if self.at_m is None else f":{self.at_m:g}")
+
 
 def read_openings(openings: Any) -> tuple[Opening | WantedOpening, ...]:
     """Read doors and windows from a string or a list.
@@ -130,7 +134,7 @@ def _placed(
     wanted: WantedOpening, walls: list[Wall], there: list[Opening], draws: np.random.Generator
 ) -> Opening:
     width_m, bottom_m, top_m = DOOR_M if wanted.kind == "door" else WINDOW_M
-    choice = _choice(wanted, walls)
+    choice = walls_for(wanted, walls)
     room_m = np.array([max(wall.length_m - width_m - 2 * MARGIN_M, 0.0) for wall in choice])
     taken = shapely.MultiLineString([[each.start_m, each.end_m] for each in there])
     where = f"on {wanted.wall} " if wanted.wall is not None else ""
@@ -156,7 +160,7 @@ def _placed(
     )
 
 
-def _choice(wanted: WantedOpening, walls: list[Wall]) -> list[Wall]:
+def walls_for(wanted: WantedOpening, walls: list[Wall]) -> list[Wall]:
     """Walls on which an opening may lie. Walls of `COMPASS` run from west to east or from north to
     south."""
     if wanted.wall is None:

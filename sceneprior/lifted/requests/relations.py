@@ -7,19 +7,7 @@ below for an object whose footprint contains the other's centre. InstructScene's
 world's axes; here they follow the front of an object, since "in front of the bed" depends on the
 direction in which the bed faces.
 
-| relation | condition |
-| --- | --- |
-| beside | the object overlaps the target along the target's front, and is at most `BESIDE_M` away \
-across it |
-| in front of | the centre lies in the front sector of the target, at most `FAR_M` from its centre |
-| facing | the target's centre lies in the front sector of the object |
-| at a wall | the footprint is at most `AT_WALL_M` from a side of the floor |
-| in a corner | the footprint is at most `CORNER_M` from a convex corner of the floor |
-| under | one centre lies in the other's footprint, and the object's top is below the target's \
-bottom or the target is a lamp; under a window: at most `REACH_M` in front of it, and below \
-its sill |
-| near | the footprints are less than `NEAR_M` apart |
-| far from | the centres are more than `FAR_M` apart, beyond which InstructScene has no relation |
+docs/requests.md lists the condition of each relation.
 """
 
 from collections.abc import Sequence

@@ -1,6 +1,6 @@
 """Requests for rooms: floor, doors and windows, ceiling, wishes and given objects."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import cached_property
 from typing import Annotated, Any, Literal
 
@@ -12,8 +12,9 @@ from sceneprior.core.classes import label_set as label_set_of
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Opening, SceneObject
 from sceneprior.core.scene_json import MOST_OBJECTS, ObjectEntry, check_box, read_object, unit_guess
+from sceneprior.lifted.requests.checks import check_request
 from sceneprior.lifted.requests.floors import Floor, read_floor
-from sceneprior.lifted.requests.openings import WantedOpening, read_openings
+from sceneprior.lifted.requests.openings import MOST_OPENINGS, WantedOpening, read_openings
 from sceneprior.lifted.requests.sentence import read_sentence
 from sceneprior.lifted.requests.wishes import OPENINGS, Conditions, Wishes, read_wishes
 
@@ -146,18 +147,24 @@ class RoomRequest(BaseModel):
         return {name: part for name, part in found.items() if part not in (None, [], ())}
 
     def conditions(
-        self, known: Sequence[str], label_set: str, most: int, stays: bool = False
+        self,
+        known: Sequence[str],
+        label_set: str,
+        most: int,
+        stays: bool = False,
+        may_meet: Collection[frozenset[str]] = (),
     ) -> "Conditions":
         """The request as a prior understands it.
 
         Without given objects, the floor is moved so that the centre of its bounding box is the
-        origin, unless it `stays`. A door or a window to which a relation refers is added if there
-        is none.
+        origin, unless it `stays`. Doors and windows that the wishes need beyond the listed ones are
+        added.
 
         Args:
             known: Classes that the prior draws.
             label_set: Name of the prior's label set.
             most: Largest number of objects in a room.
+            may_meet: Pairs of classes whose boxes may intersect.
 
         Raises:
             InputError: the prior does not understand a part, or two parts contradict each other.
@@ -172,19 +179,26 @@ class RoomRequest(BaseModel):
                         "one out."
                     )
                 outline_m = read_floor(sentence.floor)
-            if sentence.openings:
-                openings += read_openings(sentence.openings)
+            listed = list(openings)
+            for each in read_openings(sentence.openings):
+                # A door of the sentence may be a listed one.
+                fits = [o for o in listed if each in (o, WantedOpening(o.kind))]
+                if fits:
+                    listed.remove(fits[0])
+                else:
+                    openings += (each,)
             wishes = sentence.wishes
-        targets = {wish.target for wish in wishes.relations}
         for kind in OPENINGS:
-            if kind in targets and all(each.kind != kind for each in openings):
-                openings += read_openings(kind)
+            least, _ = wishes.bounds.get(kind, (0, 0))
+            lacking = min(least, MOST_OPENINGS + 1) - sum(each.kind == kind for each in openings)
+            openings += read_openings([kind] * max(lacking, 0))
         if outline_m is not None and not (self.objects or stays):
             middle = (outline_m.min(axis=0) + outline_m.max(axis=0)) / 2
             outline_m = outline_m - middle
             openings = tuple(
                 each._replace(
-                    start_m=tuple(each.start_m - middle), end_m=tuple(each.end_m - middle)
+                    start_m=tuple((each.start_m - middle).tolist()),
+                    end_m=tuple((each.end_m - middle).tolist()),
                 )
                 if isinstance(each, Opening)
                 else each
@@ -199,7 +213,7 @@ class RoomRequest(BaseModel):
                 )
         floor = None if outline_m is None else Floor(outline_m)
         found = Conditions(classes, floor, openings, self.ceiling_m, wishes, self.objects)
-        found.check_wishes(known, most)
+        check_request(found, known, most, may_meet)
         return found
 
 

@@ -107,7 +107,7 @@ class PlacementRules:
         tops_m = candidates.boxes_m[:, 1] + candidates.boxes_m[:, 4] / 2
         for name, passed in {
             "a wall behind it": backed_by_walls(self.shape, candidates, rectangles_m),
-            "room below the ceiling": tops_m <= (self.shape.ceiling_m or math.inf) + 0.01,
+            "room below the ceiling": tops_m <= (self.shape.ceiling_m or math.inf) + 1e-4,
             "distance from a door": self._leaves_free("door", label, candidates),
             "distance from a window": self._leaves_free("window", label, candidates),
         }.items():

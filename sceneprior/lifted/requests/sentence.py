@@ -5,86 +5,35 @@ the size of the floor or a room type. Unknown words are an error, so that no wis
 """
 
 import re
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from sceneprior.core.errors import InputError
-from sceneprior.lifted.requests.wishes import OPENINGS, CountWish, RelationWish, Wishes
-
-NOUNS: dict[str, tuple[str, ...]] = {
-    "bed": ("double_bed", "single_bed", "kids_bed", "bed"),
-    "double bed": ("double_bed", "bed"), "queen bed": ("double_bed",), "king bed": ("double_bed",),
-    "single bed": ("single_bed", "bed"), "twin bed": ("single_bed",),
-    "kids bed": ("kids_bed",), "children bed": ("kids_bed",), "bunk bed": ("kids_bed",),
-    "bedside table": ("nightstand", "night stand"), "night table": ("nightstand", "night stand"),
-    "nightstand": ("nightstand", "night stand"), "night stand": ("nightstand", "night stand"),
-    "closet": ("wardrobe",), "armoire": ("wardrobe",), "couch": ("sofa",), "settee": ("sofa",),
-    "sofa": ("sofa",), "lounge chair": ("armchair",), "easy chair": ("armchair",),
-    "dining chair": ("chair",), "office chair": ("chair",), "desk chair": ("chair",),
-    "dining table": ("table",), "side table": ("table",), "writing desk": ("desk",),
-    "vanity": ("dressing_table", "dresser"), "bookcase": ("bookshelf",), "cupboard": ("cabinet",),
-    "chest of drawers": ("cabinet", "dresser"), "dresser": ("dresser", "cabinet"),
-    "sideboard": ("cabinet",), "tv cabinet": ("tv_stand",), "tv bench": ("tv_stand",),
-    "tv unit": ("tv_stand",), "television stand": ("tv_stand",), "hanging lamp": ("pendant_lamp",),
-    "chandelier": ("pendant_lamp", "ceiling_lamp"), "ceiling light": ("ceiling_lamp",),
-    "lamp": ("ceiling_lamp", "pendant_lamp", "lamp"), "fridge": ("refridgerator",),
-    "refrigerator": ("refridgerator",), "tv": ("television",), "tub": ("bathtub",),
-}  # fmt: skip
-"""Classes that a noun may mean; the first class that the prior draws is used."""
-RELATION_WORDS = {
-    "beside": "beside", "next to": "beside", "at the side of": "beside", "alongside": "beside",
-    "in front of": "in front of", "before": "in front of", "facing": "facing",
-    "that faces": "facing", "which faces": "facing", "that face": "facing", "face": "facing",
-    "faces": "facing", "looking at": "facing", "at": "near", "under": "under",
-    "below": "under", "beneath": "under", "underneath": "under", "near": "near", "near to": "near",
-    "close to": "near", "by": "near", "far from": "far from", "far away from": "far from",
-    "away from": "far from",
-}  # fmt: skip
-"""Relations to an object, a door or a window."""
-ROOM_WORDS = {
-    f"{word} {article} {noun}": relation
-    for noun, relation, words in (
-        ("wall", "at a wall", ("at", "against", "along", "on", "by")),
-        ("corner", "in a corner", ("in", "at")),
-    )
-    for word in words
-    for article in ("a", "the", "one")
-}
-"""Relations to the room."""
-NUMBERS = {
-    "no": 0, "zero": 0, "without": 0, "a": 1, "an": 1, "one": 1, "another": 1, "two": 2, "three": 3,
-    "four": 4, "five": 5, "six": 6, "seven": 7, "eight": 8, "nine": 9, "ten": 10, "eleven": 11,
-    "twelve": 12,
-}  # fmt: skip
-BOUNDS = {"at least": ">=", "at most": "<=", "no more than": "<=", "no fewer than": ">=",
-          "up to": "<=", "exactly": ""}  # fmt: skip
-WALL_WORDS = {
-    f"{word} the {wall}{end}": wall
-    for word in ("in", "on", "to", "at")
-    for wall in ("north", "east", "south", "west")
-    for end in (" wall", "")
-}
-"""Walls of doors and windows."""
-ROOMS = {
-    "bedroom": ("bedroom", "all"), "living room": ("living", "all"),
-    "dining room": ("dining", "all"), "library": ("library", "all"),
-    "kitchen": ("kitchen", "all"), "room": (),
-}  # fmt: skip
-"""Room types, each with the endings of the label sets that contain it; `room` matches any."""
-FILLERS = (
-    "and", "with", ",", ";", ".", ":", "but", "also", "then", "please", "i", "we", "want", "would",
-    "like", "need", "give", "me", "us", "make", "draw", "is", "are", "be", "stands", "stand",
-    "standing", "placed", "put", "that", "which", "there", "has", "have", "having", "containing",
-    "should",
+from sceneprior.lifted.requests.vocabulary import (
+    BOUNDS,
+    FILLERS,
+    NOUNS,
+    NUMBERS,
+    RELATION_WORDS,
+    ROOM_WORDS,
+    ROOMS,
+    WALL_WORDS,
 )  # fmt: skip
-"""Words that are skipped."""
+from sceneprior.lifted.requests.wishes import (
+    OPENINGS,
+    CountWish,
+    RelationWish,
+    Wishes,
+    count_of,
+)  # fmt: skip
+
 LONGEST = 2000
 """Maximum number of characters of a sentence."""
 _UNIT = r"\s*(?:m|metres?|meters?)?"
 _SIZE = re.compile(rf"(\d+\.?\d*){_UNIT}\s*(?:x|×|by)\s*(\d+\.?\d*){_UNIT}\b(?!\s*[cm]m\b)")
 _LENGTH = re.compile(r"\d+\.?\d*\s*(?:mm|cm|m|metres?|meters?|centimetres?|centimeters?)\b")
+_NEGATIVE = re.compile(r"(?:(?<!\w)|(?<=[x×]))[-−]\d[\w.]{0,9}")
 _SIZE_TOKEN = "#"
 """Token for the size of the floor, so that it is not mistaken for the size of furniture."""
 _TOKEN = re.compile(r"[a-z_']+|\d+(?:\.\d+)?|\S")
@@ -114,6 +63,10 @@ def read_sentence(text: str, known: Sequence[str], label_set: str) -> Sentence:
     """
     if len(text) > LONGEST:
         raise InputError(f"The request has {len(text)} characters; expected at most {LONGEST}.")
+    if (negative := _NEGATIVE.search(text.lower())) is not None:
+        raise InputError(
+            f"The request has a number below 0 ('{negative[0]}'); numbers and sizes are above 0."
+        )
     lowered = text.lower().replace("-", " ")
     sizes = _SIZE.findall(lowered)
     if len(sizes) > 1:
@@ -193,7 +146,7 @@ def _lex(words: list[str], meanings: dict[str, tuple[str, Any]]) -> list[_Token]
             if (phrase := " ".join(words[:length])) in meanings:
                 break
         if phrase.isdecimal():
-            tokens.append(_Token(phrase, "number", int(phrase)))
+            tokens.append(_Token(phrase, "number", count_of(phrase)))
         else:
             tokens.append(_Token(phrase, *meanings.get(phrase, ())))
         words = words[length:]
@@ -210,6 +163,9 @@ class _Group:
     """`>=`, `<=`, or empty for exactly."""
     new: bool
     """False for "the bed", which refers to an object mentioned elsewhere."""
+    counted: bool
+    """True if it has a number of its own."""
+    said: str
 
 
 class _Reader:
@@ -236,22 +192,32 @@ class _Reader:
     def wishes(self) -> Wishes:
         """The counts of all groups of the sentence, summed by class, and the relations between
         them."""
-        groups = [group for group in self.groups if group.noun not in OPENINGS]
+        bare, exact = [group for group in self.groups if not group.sign], dict[str, list[_Group]]()
+        for group in bare:
+            if group.new and group.number:
+                exact.setdefault(group.noun, []).append(group)
         counts = [
-            CountWish(group.noun, 0, group.number)
+            CountWish(group.noun, 0, group.number, group.said)
             if group.sign == "<="
-            else CountWish(group.noun, group.number)
-            for group in groups
+            else CountWish(group.noun, group.number, None, group.said)
+            for group in self.groups
             if group.sign
         ]
-        exact: Counter[str] = Counter()
-        for group in groups:
-            if group.new and not group.sign:
-                exact[group.noun] += group.number
-        counts += [CountWish(noun, number, number) for noun, number in exact.items()]
-        named = {wish.label for wish in counts}
-        others = dict.fromkeys(group.noun for group in groups if group.noun not in named)
-        return Wishes((*counts, *(CountWish(noun, 1) for noun in others)), tuple(self.relations))
+        for noun, own in exact.items():
+            total, said = sum(group.number for group in own), " and ".join(g.said for g in own)
+            counts.append(CountWish(noun, total, total, said))
+        # "A bed and no bed" is no sum.
+        counts += [CountWish(group.noun, 0, 0, group.said) for group in bare if not group.number]
+        implied = {wish.target for wish in self.relations}.intersection(OPENINGS)
+        for group in bare:
+            if group.new or not group.number or group.noun in implied:
+                continue
+            # "The two beds" are all beds, unless beds are named elsewhere.
+            most = group.number if group.counted and group.noun not in exact else None
+            others = [wish.least for wish in counts if wish.label == group.noun]
+            if most or group.number > max(others, default=0):
+                counts.append(CountWish(group.noun, group.number, most, group.said))
+        return Wishes(tuple(counts), tuple(self.relations))
 
     def _next(self, *kinds: str) -> _Token | None:
         """Read the next token if it is of one of these kinds."""
@@ -313,17 +279,30 @@ class _Reader:
         if sized:
             raise _other_length(f"of the {noun.replace('_', ' ')}")
         sign = bound.value if bound else ""
+        if bound and number is None:  # "at most nightstands"
+            self.strange.append(bound.text)
         if number is None:
-            number = 2 if plural and not definite and not some else 1
+            number = 2 if plural and not some else 1
             sign = ">=" if not definite else sign
-        group = _Group(noun, number, sign, not definite)
+        said = " ".join(token.text for token in self.tokens[start : self.at])
+        group = _Group(noun, number, sign, not definite, counted is not None, said)
         if noun in OPENINGS:
-            wall = self._next("wall")
-            if group.new and group.sign != "<=":
-                self.openings += [f"{noun}@{wall.value}" if wall else noun] * number
+            self._opening(group, self._next("wall"))
         self.groups.append(group)
         self.subject = group
         return group
+
+    def _opening(self, group: _Group, wall: _Token | None) -> None:
+        """List the doors or windows of a group, unless it sets only an upper bound."""
+        named = f"{group.noun}@{wall.value}" if wall else group.noun
+        if wall and (not group.number or group.sign == "<="):
+            self.strange.append(wall.text)
+        elif group.new and group.sign != "<=":
+            self.openings += [named] * group.number
+        elif wall and named not in self.openings:  # "the door in the north wall"
+            if group.noun in self.openings:
+                self.openings.remove(group.noun)
+            self.openings.append(named)
 
     def _room(self, number: int | None, bound: _Token | None) -> bool:
         """Read a room type, and refuse a type that the prior does not draw."""

@@ -5,14 +5,14 @@ import math
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
-from sceneprior.core.checked import shown
-from sceneprior.core.classes import unknown_class
+from sceneprior.core.checked import plain, shown
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Opening, SceneObject
+from sceneprior.core.scene_json import MOST_OBJECTS
 from sceneprior.lifted.requests.floors import Floor
 from sceneprior.lifted.requests.openings import WantedOpening
 
@@ -20,6 +20,8 @@ TO_ROOM = ("at a wall", "in a corner")
 """Relations to the room, which have no target."""
 TO_TARGET = ("beside", "in front of", "facing", "under", "near", "far from")
 """Relations to another object, a door or a window."""
+BY_FRONT = ("beside", "in front of", "facing")
+"""Relations that depend on the front of an object."""
 RELATIONS = (*TO_TARGET, *TO_ROOM)
 OPENINGS = ("door", "window")
 """Targets that are not furniture."""
@@ -29,12 +31,15 @@ _ENTRY = re.compile(r"\s*(\w+)\s*:\s*(\S.*?)\s*")
 
 @dataclass(frozen=True)
 class CountWish:
-    """Bounds on the number of objects of a class in a room, which includes the given objects."""
+    """Bounds on the number of objects of a class, or of doors or windows, in a room, which includes
+    the given ones."""
 
     label: str
     least: int
     most: int | None = None
     """None for no upper bound."""
+    said: str = field(default="", compare=False)
+    """Words of a sentence that express the wish, for messages."""
 
     def __str__(self) -> str:
         if self.most is None:
@@ -72,24 +77,26 @@ class Wishes:
     relations: tuple[RelationWish, ...] = ()
 
     @cached_property
-    def bounds(self) -> dict[str, tuple[int, int | float]]:
-        """Smallest and largest number of objects, by class, that meet all wishes; subjects and
-        targets of relations are required, too."""
-        needs = [
-            (wish.label, wish.least, math.inf if wish.most is None else wish.most)
-            for wish in self.counts
-        ]
+    def needs(self) -> dict[str, list[CountWish]]:
+        """Bounds by class or kind of opening; relations require their subjects and targets."""
+        needs = list(self.counts)
         for wish in self.relations:
-            alike = wish.subject == wish.target
-            needs.append((wish.subject, max(wish.count, 2 if alike else 1), math.inf))
+            least = max(wish.count, 2 if wish.subject == wish.target else 1)
+            needs.append(CountWish(wish.subject, least, said=str(wish)))
             if wish.target is not None:
-                needs.append((wish.target, 1, math.inf))
-        bounds: dict[str, tuple[int, int | float]] = {}
-        for label, least, most in needs:
-            if label not in OPENINGS:
-                low, high = bounds.get(label, (0, math.inf))
-                bounds[label] = max(low, least), min(high, most)
-        return bounds
+                needs.append(CountWish(wish.target, 1, said=str(wish)))
+        return {n.label: [each for each in needs if each.label == n.label] for n in needs}
+
+    @cached_property
+    def bounds(self) -> dict[str, tuple[int, int | float]]:
+        """Smallest and largest numbers that meet all `needs`."""
+        return {
+            label: (
+                max(n.least for n in own),
+                min(math.inf if n.most is None else n.most for n in own),
+            )
+            for label, own in self.needs.items()
+        }
 
 
 @dataclass(frozen=True)
@@ -113,13 +120,15 @@ class Conditions:
         return [
             self.classes.index(label)
             for label, (least, _) in self.wishes.bounds.items()
+            if label not in OPENINGS
             for _ in range(least - given[label])
         ]
 
     @property
     def most(self) -> list[float]:
         """Largest number of objects of each class."""
-        return [float(self.wishes.bounds.get(label, (0, math.inf))[1]) for label in self.classes]
+        bounds = {key: own for key, own in self.wishes.bounds.items() if key not in OPENINGS}
+        return [float(bounds.get(label, (0, math.inf))[1]) for label in self.classes]
 
     @property
     def has_rules(self) -> bool:
@@ -127,37 +136,6 @@ class Conditions:
         must be checked: openings, a ceiling, relations, or a floor that is not a rectangle."""
         odd_floor = self.floor is not None and not self.floor.is_rectangle
         return bool(self.openings or self.wishes.relations or self.ceiling_m or odd_floor)
-
-    def check_wishes(self, known: Sequence[str], most: int) -> None:
-        """Reject wishes that no room of a prior can meet.
-
-        Args:
-            known: Classes that the prior draws.
-            most: Maximum number of objects in a room.
-
-        Raises:
-            InputError: a class is unknown, or counts and relations contradict each other.
-        """
-        given, total = Counter(item.label for item in self.objects), 0
-        for label in dict.fromkeys([*self.wishes.bounds, *given]):
-            least, largest = self.wishes.bounds.get(label, (0, math.inf))
-            if label not in known and (least > given[label] or label not in given):
-                raise unknown_class(label, known)
-            if least > largest:
-                raise InputError(
-                    f"The wishes need {least} {label} and allow {largest}; change one of them."
-                )
-            if given[label] > largest:
-                raise InputError(
-                    f"The room is given with {given[label]} {label}, and the wishes allow "
-                    f"{largest}; change one of them."
-                )
-            total += max(least, given[label])
-        if total > most:
-            raise InputError(
-                f"The given and the requested objects are {total} together, but rooms of this run "
-                f"hold at most {most} (model.max_objects); ask for fewer."
-            )
 
 
 def read_wishes(want: Any) -> Wishes | None:
@@ -200,16 +178,31 @@ def count_wish(label: str, value: Any) -> CountWish:
     Raises:
         InputError: `value` has another form.
     """
-    is_number = isinstance(value, str | int) and not isinstance(value, bool)
-    if not is_number or (found := _COUNT.fullmatch(str(value))) is None:
+    if isinstance(value, int) and not isinstance(value, bool):
+        value = shown(value)  # Python writes no integers of more than 4,300 digits
+    if not isinstance(value, str) or (found := _COUNT.fullmatch(value)) is None:
         raise InputError(
-            f"The wish for {label} is {str(value)[:40]!r}; expected a number of objects such as 2, "
-            '">=1" or "<=3".'
+            f"The wish for {plain(label)} is {str(value)[:40]!r}; expected a number of objects "
+            'such as 2, ">=1" or "<=3".'
         )
-    sign, number = found.group(1), int(found.group(2))
+    sign, number = found.group(1), count_of(found.group(2))
     if sign == ">=":
         return CountWish(label, number)
     return CountWish(label, 0 if sign == "<=" else number, number)
+
+
+def count_of(digits: str) -> int:
+    """The number of objects that digits stand for.
+
+    Raises:
+        InputError: it is above `MOST_OBJECTS`.
+    """
+    if len(digits) > 9 or int(digits) > MOST_OBJECTS:
+        raise InputError(
+            f"The request has the number {plain(digits, 30)}; expected at most {MOST_OBJECTS} "
+            "objects."
+        )
+    return int(digits)
 
 
 def relation_wish(entry: Mapping[str, Any]) -> RelationWish:
@@ -227,10 +220,19 @@ def relation_wish(entry: Mapping[str, Any]) -> RelationWish:
     subject, relation, target = (entry.get(key) for key in ("subject", "relation", "target"))
     count = entry.get("count", 1)
     if relation not in RELATIONS:
-        raise InputError(f"No relation is called '{relation}'; choose from {', '.join(RELATIONS)}.")
+        raise InputError(
+            f"No relation is called {shown(relation)}; choose from {', '.join(RELATIONS)}."
+        )
+    if not isinstance(subject, str) or subject in OPENINGS:
+        raise InputError(f"The subject of a relation is {shown(subject)}; expected a class.")
     if (target is None) != (relation in TO_ROOM):
         needs = "takes no target" if relation in TO_ROOM else "needs a target"
-        raise InputError(f"The relation '{relation}' {needs}; the request has {target!r}.")
-    if not isinstance(count, int) or isinstance(count, bool) or count < 1:
-        raise InputError(f"A relation has count {count!r}; expected a whole number above 0.")
-    return RelationWish(str(subject), str(relation), None if target is None else str(target), count)
+        raise InputError(f"The relation '{relation}' {needs}; the request has {shown(target)}.")
+    if not isinstance(count, int) or isinstance(count, bool) or not 0 < count <= MOST_OBJECTS:
+        raise InputError(
+            f"A relation has count {shown(count)}; expected a whole number from 1 to "
+            f"{MOST_OBJECTS}."
+        )
+    return RelationWish(
+        subject, str(relation), None if target is None else plain(str(target)), count
+    )

@@ -79,7 +79,10 @@ def test_rooms_say_which_prior_made_them(name, tmp_path):
         "seed": 3,
         "distribution": "sampler",
         "request": {"floor": [[0, 0], [4, 0], [4, 3.5], [0, 3.5]], "openings": "door"},
-        "wishes": [],
+        "wishes": [
+            {"wish": "door", "holds": True},
+            {"wish": "all on the floor of 4 x 3.5 m", "holds": True},
+        ],
     }
     assert room.extra == wanted
     for ending in ("json", "glb"):

@@ -13,7 +13,8 @@ KNOWN = [
 @pytest.mark.parametrize(
     ("text", "floor", "openings", "counts", "relations"),
     [
-        ("a 4 x 3 m bedroom with a door, two nightstands", "4x3", ["door"], ["2 nightstand"], []),
+        ("a 4 x 3 m bedroom with a door, two nightstands", "4x3", ["door"],
+         ["1 door", "2 nightstand"], []),
         (
             "A double bed and two nightstands beside it, a desk under the window, no sofa.",
             None, [], ["1 double_bed", "2 nightstand", "1 desk", "0 sofa"],
@@ -30,7 +31,7 @@ KNOWN = [
         (
             "bookshelves and some chairs, 3.5m by 4 metres, a door in the south wall and 2 windows",
             "3.5x4", ["door@south", "window", "window"],
-            ["at least 2 bookshelf", "at least 1 chair"], [],
+            ["at least 2 bookshelf", "at least 1 chair", "1 door", "2 window"], [],
         ),
         (
             "two chairs at the table and a chair in the corner", None, [],
@@ -41,6 +42,8 @@ KNOWN = [
          ["1 nightstand", "at least 1 double_bed"],
          ["nightstand beside double_bed", "nightstand far from door"]),
         ("without a sofa", None, [], ["0 sofa"], []),
+        ("a door, the two chairs far from the door in the north wall", None, ["door@north"],
+         ["1 door", "2 chair"], ["2 chair far from door"]),
     ],
 )  # fmt: skip
 def test_sentences(text, floor, openings, counts, relations):
