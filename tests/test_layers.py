@@ -40,11 +40,11 @@ MAY_TOO = {
 }
 
 BUDGET = {
-    "data_prep": (12578, 59),
-    "sceneprior/core": (5654, 28),
+    "data_prep": (12598, 59),
+    "sceneprior/core": (5669, 28),
     "sceneprior/furniture": (588, 4),
     "sceneprior/render": (4490, 23),
-    "sceneprior/training": (864, 5),
+    "sceneprior/training": (884, 5),
     "sceneprior/paper": (2405, 12),
     "sceneprior/lifted": (8174, 41),
     "sceneprior/baselines": (2909, 14),

@@ -12,6 +12,7 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from data_prep.engine.source import Line, PreparedRoom, RoomTask, Source
+from sceneprior.core.checked import shown
 from sceneprior.core.classes import label_set
 from sceneprior.core.shards import INDEX_NAME, SPLITS
 
@@ -19,6 +20,7 @@ REPORT_NAME = "report.json"
 TABLE_NAME = "report.csv"
 REPORT_FILES = (INDEX_NAME, REPORT_NAME, TABLE_NAME)
 """Files of a finished folder, in the order of their deletion when work begins again."""
+_NAMED = 5
 _SHOWN = 10
 """Number of notes, and of failures, that the terminal shows."""
 _COUNTS = ("rooms", "views", "objects")
@@ -188,7 +190,21 @@ class Summary:
             for status in ("filtered", "failed")
             if self.statuses.get(status)
         )
-        return "; ".join(parts) + (f"; {left_out} ({TABLE_NAME} says why)" if left_out else "")
+        parts += [f"{left_out} ({TABLE_NAME} says why)"] * bool(left_out)
+        if self.source.label_set.startswith("void,"):  # the user's own list
+            there = {name for line in self.lines for name in line.classes}
+            empty = [name for name in label_set(self.source.label_set)[1:] if name not in there]
+            parts += [f"no object is {' or '.join(empty)}"] * bool(empty)
+        return "; ".join([*parts, *without_class(self.lines)])
+
+
+def without_class(lines: Iterable[Line]) -> list[str]:
+    """A phrase on what has a name that is no class of the label set; empty if there is none."""
+    counts = _most_first(_sums(line.unknown_categories for line in lines))
+    named = ", ".join(shown(name) for name, _ in counts[:_NAMED])
+    more = ", ..." if len(counts) > _NAMED else ""
+    total = sum(count for _, count in counts)
+    return [f"{total} objects or masks whose name is no class ({named}{more})"] * bool(counts)
 
 
 def make_table(
@@ -241,7 +257,7 @@ def report_tables(report: dict[str, Any]) -> list[Table]:
     more = f"and {len(notes) - _SHOWN} more: report.csv", ""
     add_some("note of prepared rooms", "rooms", notes, more)
     if unknown := _most_first(report["unknown_categories"]):
-        why = "counted as void: the recipe does not list them"
+        why = "counted as void: neither label set nor recipe lists them"
         tables.append(make_table(("category without a class", "pieces"), unknown, why))
     failed = [(item["room_id"], item["reason"]) for item in report["failed"]]
     more = f"and {len(failed) - _SHOWN} more", "report.csv lists all of them"

@@ -140,6 +140,7 @@ def verdict(found: FolderCheck) -> str:
             unchecked.append(f"the scale of {alone} rooms, each for itself (too few objects)")
         unchecked += ["the height of the floor"] * (evidence.floor_m is None)
         unchecked.append("whether all pictures are mirror images")
+    unchecked += found.without_class
     left = f"nothing wrong is found, but these could not be checked: {', '.join(unchecked)}."
     return left if unchecked else "all is well."
 

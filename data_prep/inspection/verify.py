@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from data_prep.engine.plan import in_words
-from data_prep.engine.report import REPORT_NAME
+from data_prep.engine.report import REPORT_NAME, without_class
 from data_prep.engine.source import Line, pool
 from data_prep.inspection.agreement import (
     Agreement,
@@ -67,6 +67,8 @@ class FolderCheck:
     """Rooms by split."""
     problems: tuple[str, ...]
     """Problems as sentences, each with its file or room; empty if nothing is wrong."""
+    without_class: Sequence[str] = ()
+    """A phrase on objects whose name is no class of the label set, if there are any."""
 
     @property
     def every(self) -> list[RoomCheck]:
@@ -94,7 +96,7 @@ def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> Folder
     index = read_index(folder)
     name, source = str(index.get("label_set")), str(index.get("source"))
     label_set(name)
-    usual, conventions, failures = read_conventions(folder, source)
+    usual, conventions, failures, unknown = read_conventions(folder, source)
     problems = [f"{folder}: {failures}."] if failures and room_id is None else []
     rooms: dict[str, list[RoomCheck]] = {}
     for split in splits_of(folder):
@@ -103,7 +105,7 @@ def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> Folder
             arguments = [(folder, path, name, room_id, usual, conventions) for path in paths]
             parts = run(_check_shard, arguments, f"checking {split}")
             rooms[split] = [room for part in parts for room in part]
-    found = FolderCheck(rooms, ())
+    found = FolderCheck(rooms, (), unknown)
     if not found.every:
         raise InputError(
             f"{folder} has no room '{room_id}'; its report.csv lists the rooms."
@@ -125,9 +127,9 @@ def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> Folder
 
 def read_conventions(
     folder: Path, source: str
-) -> tuple[Convention, dict[str, Convention], str | None]:
+) -> tuple[Convention, dict[str, Convention], str | None, list[str]]:
     """The usual convention of a source, those of rooms whose file of poses the report names, by id,
-    and a sentence if more rooms failed than were prepared.
+    a sentence if more rooms failed than were prepared, and `without_class`.
 
     If the report is missing or from an earlier release, the usual convention is assumed.
     """
@@ -140,11 +142,11 @@ def read_conventions(
             if line.cameras
         }
     except (InputError, KeyError, TypeError, ValueError):
-        return usual, {}, None
+        return usual, {}, None, []
     failed = [line for line in lines if line.status == "failed"]
     prepared = sum(line.status == "prepared" for line in lines)
     said = f"{len(lines)} rooms, {prepared} prepared: {in_words(failed)}"
-    return usual, rooms, said if len(failed) > prepared else None
+    return usual, rooms, said if len(failed) > prepared else None, without_class(lines)
 
 
 def _mistakes(folder: Path, rooms: Sequence[RoomCheck]) -> list[str]:
@@ -279,8 +281,7 @@ def _check_room(shard: Shard, folder: Path, check: RoomCheck) -> RoomCheck:
 
 
 def array_problems(views: RoomViews, classes: int) -> Iterator[str]:
-    """Report values out of range in the views; `Shard.read_room` has checked that they are
-    finite."""
+    """Report values out of range in the views, which are finite (see `Shard.read_room`)."""
     if (views.object_class < 1).any():
         yield f"a class index is outside 1 to {classes - 1}"
     turn = views.world_to_camera[:, :3, :3].astype(np.float64)
@@ -336,10 +337,7 @@ def mask_problems(views: RoomViews) -> list[str]:
 
 
 def truth_problems(views: RoomViews, truth: RoomGroundTruth) -> Iterator[str]:
-    """Report ground truth that is inconsistent in itself or with the tracked objects.
-
-    `Shard.read_ground_truth` has checked that its numbers are finite and its arrays equally long.
-    """
+    """Report ground truth, read and finite, that contradicts itself or the tracked objects."""
     if truth.unoccluded is not None and truth.unoccluded.shape != views.visible.shape:
         came = truth.unoccluded.shape
         yield f"ground truth: unoccluded has shape {came}, expected {views.visible.shape}"

@@ -62,6 +62,8 @@ class FramedRoom:
     """True if walls run along x and z; otherwise their direction is found from the masks."""
     world_from_file: np.ndarray = field(default_factory=lambda: np.eye(4))
     """Rigid transform, (4, 4), from the world of the files, in metres, to this one."""
+    outside: Mapping[str, int] = field(default_factory=dict)
+    """Number of objects, or of masks without tracks, by name outside the user's label set."""
     poses_file: str = ""
     """Name of the file of poses, for `inspect --verify`."""
 
@@ -156,7 +158,8 @@ def prepare_room(task: RoomTask, room: FramedRoom) -> PreparedRoom | Line:
     seen = observe(room.ids, room.object_class)
     if not len(seen.tracked):
         why = f"none of its {len(room.ids)} views shows any object"
-        return Line(room_id, task.house, "filtered", "no_view", why, notes=notes)
+        line = Line(room_id, task.house, "filtered", "no_view", why, notes=notes)
+        return replace(line, unknown_categories=dict(room.outside))
     room = replace(room, ids=seen.instance_ids)  # frees the given ones
     if room.may_err:
         found = correct(seen, room_cameras(room.camera_to_world), room.intrinsics)
@@ -196,7 +199,7 @@ def prepare_room(task: RoomTask, room: FramedRoom) -> PreparedRoom | Line:
         notes.append(f"{missing} of {len(seen.tracked)} objects have no 3D box: no ground truth")
     origin_of = {"file": room.poses_file, "room_from_world": room.world_from_file.round(9).tolist()}
     return PreparedRoom(
-        views, truth, models, notes=tuple(notes), cameras=origin_of if room.poses_file else {}
+        views, truth, models, tuple(notes), room.outside, origin_of if room.poses_file else {}
     )
 
 

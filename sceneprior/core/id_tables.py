@@ -3,7 +3,8 @@
 import json
 import re
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -117,6 +118,16 @@ def stuff_of(name: str) -> int:
     return STUFF.index(_OTHER_NAMES.get(found[1], found[1])) if found else 0
 
 
+def nearest(name: str, classes: Sequence[str]) -> str:
+    """End of a sentence that asks for the most similar class; "" if none is similar.
+
+    >>> nearest("##chair", ["void", "bed", "chair"]), nearest("teapot", ["bed", "chair"])
+    (': chair?', '')
+    """
+    near = get_close_matches(tidy(re.sub(r"\W+", " ", name)), classes, n=1, cutoff=0.7)
+    return f": {near[0]}?" if near else ""
+
+
 class IdTable:
     """Maps values of masks to consecutive ids for `observe`.
 
@@ -134,14 +145,18 @@ class IdTable:
         indices = [names.get(tidy(of_id[key]), VOID) for key in objects]
         self.classes = np.array([*indices, VOID], dtype=np.int16)
         if not self.classes.any():
-            came = ", ".join(map(plain, sorted(set(of_id.values()))[:10]))
+            some = sorted(set(of_id.values()))[:10]
+            came = ", ".join(plain(name) + nearest(name, [*names]) for name in some)
             raise InputError(
                 f"{where}: none of its classes ({came}) is in the label set "
                 f"({', '.join(list(names)[1:11])}{', ...' if len(names) > 11 else ''})."
             )
-        others = Counter(of_id[key] for key in objects if tidy(of_id[key]) not in names)
-        told = ", ".join(f"{plain(name)} ({count})" for name, count in sorted(others.items()))
-        self.notes = [f"classes outside the label set are void: {told}"] if others else []
+        self.outside = Counter(of_id[key] for key in objects if tidy(of_id[key]) not in names)
+        told = ", ".join(
+            f"{plain(name)} ({count}{nearest(name, [*names])})"
+            for name, count in sorted(self.outside.items())
+        )
+        self.notes = [f"classes outside the label set are void: {told}"] if told else []
         self.unlisted: set[int] = set()
         # The last entry is for the value -1.
         self._table = np.full(LARGEST_ID + 2, len(objects) + 1, dtype=np.uint32)

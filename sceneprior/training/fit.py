@@ -15,8 +15,9 @@ import lightning
 import torch
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 
-from sceneprior.core.errors import ConfigError, InputError
-from sceneprior.core.files import only_writer, remove_parts
+from sceneprior.core.checked import shown
+from sceneprior.core.errors import ConfigError, InputError, InputWarning
+from sceneprior.core.files import only_writer, read_json, remove_parts
 from sceneprior.core.settings import check_settings, dump_settings, read_settings
 from sceneprior.training.callbacks import (
     RollingCheckpoint,
@@ -125,6 +126,8 @@ def _train(
     # Before anything is computed, since the prototypes' codes depend on the rounding of sums, too.
     torch.set_num_threads(settings.cpu_threads or 1)
     rooms = stage.open_data()
+    if previous is None and first_process():
+        warn_of_losses(Path(config.data.shards), len(rooms.plain_ids))
     module = stage.build(rooms, previous)
     latents = getattr(module, "latents", None)
     pairs_no_room = latents is not None and not len(latents.weight)  # the table is empty
@@ -193,6 +196,23 @@ def _train(
         signal.signal(signal.SIGINT, before)  # Lightning leaves it ignored
         raise KeyboardInterrupt from None
     write_checkpoint(trainer, folder, "final.ckpt")
+
+
+def warn_of_losses(shards: Path, rooms: int) -> None:
+    """Warn if fewer training rooms are found than were prepared, or if a third of the objects has
+    no class, by the report of the shards; nothing is said without a report."""
+    with contextlib.suppress(InputError, KeyError, TypeError, AttributeError):
+        report = read_json(shards / "report.json")
+        there = report["counts"]["train"]["rooms"]
+        if rooms < there:
+            said = f"{rooms} of the {there} rooms prepared for 'train' are left in {shards}"
+            warnings.warn(f"Only {said}; prepare them again.", InputWarning, stacklevel=1)
+        known, unknown = (sum(report[k].values()) for k in ("classes", "unknown_categories"))
+        if 2 * unknown >= known > 0:
+            named = ", ".join(map(shown, [*report["unknown_categories"]][:5]))
+            said = f"{unknown} objects or masks of {shards} have no class, and {known} objects have"
+            why = f"their names ({named}) are not in the label set, so they are not learned"
+            warnings.warn(f"{said} one: {why}.", InputWarning, stacklevel=1)
 
 
 def make_logger(name: str, folder: Path) -> Logger:

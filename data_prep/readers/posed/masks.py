@@ -232,6 +232,7 @@ def read_tracked(
     return {
         "ids": np.stack(images),
         "object_class": table.classes,
+        "outside": table.outside,
         "stuff": np.stack(stuff),
         "intrinsics": np.stack(intrinsics),
         "notes": (*notes, *of_lenses),
@@ -284,6 +285,7 @@ def read_untracked(
     return {
         "ids": np.where(tracks.ids < 0, count + 1, tracks.ids).astype(np.uint32),
         "object_class": np.array([*tracks.object_class, VOID]),
+        "outside": table.outside,
         "stuff": thinned_stuff(table.stuff(numbers)),
         "intrinsics": intrinsics,
         "notes": tuple(notes),

@@ -15,7 +15,9 @@ from data_prep.readers.posed.formats import MASKS, read_formats, read_label_set
 from data_prep.readers.posed.masks import find_table
 from data_prep.readers.posed.reader import Posed
 from data_prep.readers.posed.transforms import POSES, read_recording
+from sceneprior.core.errors import InputWarning
 from sceneprior.core.id_tables import read_class_table
+from sceneprior.training.fit import warn_of_losses
 
 TRACKED = {
     "sam2, without masks of what is hidden": lambda room: tools.write_sam2(room, hidden=False),
@@ -151,6 +153,29 @@ def test_crowds_and_ids_without_a_segment_are_void(room):
     assert made.views.object_class.tolist() == [1]
     assert "classes outside the label set are void: backpack (1), crowd (1)" in made.notes
     assert any("masks show ids that the table of classes does not have" in n for n in made.notes)
+
+
+def test_names_that_are_no_class_are_counted_to_the_end(room, cli, tmp_path):
+    """Near matches are suggested; the summary, `--verify` and `fit` name what has no class."""
+    table = json.loads((room.folder / "classes.json").read_text())
+    key = next(key for key, name in table.items() if name in SET.split(","))
+    table[key] = f"##{table[key]}."
+    (room.folder / "classes.json").write_text(json.dumps(table))
+    made = prepared(room)
+    assert made.unknown_categories[table[key]] == 1
+    assert any(f"(1: {table[key].strip('#.')}?)" in note for note in made.notes)
+    out = tmp_path / "shards"
+    done = cli("prep-posed", room.folder, "--out", out, "--label-set", f"{SET},piano",
+               "--workers", 1)  # fmt: skip
+    for text in (done.output, cli("inspect", out, "--verify").output):
+        assert "objects or masks whose name is no class" in " ".join(text.split())
+        assert "all is well" not in text
+    assert "no object is" in done.output and "piano" in done.output
+    with pytest.warns(InputWarning) as told:
+        warn_of_losses(out, 0)
+    assert "0 of the 1 rooms" in str(told[0].message)
+    if sum(made.unknown_categories.values()) * 2 >= len(made.views.object_class):
+        assert table[key] in str(told[1].message)
 
 
 def test_optimized_keyframes_of_polycam_are_preferred(room):
