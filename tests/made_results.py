@@ -8,6 +8,8 @@ from tiny_runs import tiny_baseline_settings, tiny_lifted_settings, write_tiny_c
 
 from sceneprior.core.files import write_json
 from sceneprior.evaluation.metrics import DECODED, METRICS
+from sceneprior.evaluation.score_table import FORMAT
+from sceneprior.evaluation.synthesis import VERSION
 
 SAMPLER = {"epochs": 3, "width": 16, "layers": 1, "heads": 2, "val_every": 1}
 KEYS = [metric.key for metric in (*METRICS, *DECODED) if metric.column]
@@ -55,8 +57,10 @@ def write_new_rooms(path: Path, number: int, latents: str, remembers: bool) -> N
     ends = {key: [0.9 * value, 1.1 * value] for key, value in scores.items() if value}
     counts = {"n_generated": 4, "n_test": 3, "n_train_rooms": 12}
     scores |= {
+        "format": FORMAT,
+        "version": VERSION,
         "intervals": {"generated": ends},
-        "protocol": {**counts, "shards": "front", "latents": latents},
+        "protocol": {**counts, "label_set": "toys", "shards": "front", "latents": latents},
         "independent": made_columns(9.5, KEYS[:6]),
         "independent_meshes": made_columns(7.5, KEYS[:4]),
         "shuffled": made_columns(5.5, KEYS[3:]),

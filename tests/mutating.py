@@ -1,22 +1,15 @@
-"""Random damage to bytes, and to values inside a file; and a reader in a process of its own."""
+"""Random damage to bytes, words and values, by a file's type."""
 
+import io
 import json
-import os
-import resource
-import subprocess
-import sys
-from collections.abc import Iterator, Sequence
+import struct
+import zipfile
+from collections.abc import Iterator
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-MUTATIONS = 300
-MOST_BYTES = 6 * 2**30
-"""Address space of a reader; torch alone reserves some of it."""
-MOST_RESIDENT = 2 * 2**30
-MOST_S = 300
 
 DEEP = "@deep@"
 JUNK: list[Any] = [
@@ -30,26 +23,38 @@ JUNK: list[Any] = [
 WORDS = ("99", "-9", "0", "nan", "1e999", "x", "-1", "9" * 400, "", "\ufffd", "#", "= =", "\0")
 """Words that replace others in texts."""
 
-_READER = """
-import importlib.util, json, resource, sys
-from pathlib import Path
-from sceneprior.core.errors import InputError
+ODD_YAML = (
+    "*a", "&a [*a]", "[[[[", "{a: {b: {c: 1}}}", "!!set {1, 2}", "!!binary aGVsbG8=", ".nan", "-1",
+    "99999999999999999999999", "2001-99-99", "~", "'", '"\\x0', "? [1]",
+    "[" * 3000, "x" * 5000, "1e400", "!!python/object:os.system 1", "<<: *a",
+)  # fmt: skip
+"""Values of settings that replace others."""
 
-spec = importlib.util.spec_from_file_location("reader", sys.argv[1])
-module = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(module)
-for name in sys.argv[3:]:
-    print(json.dumps(["begun", name]), flush=True)
-    try:
-        getattr(module, sys.argv[2])(Path(name))
-        said = ""
-    except InputError as error:
-        said = f"{type(error).__name__}: {error}"
-    except Exception as error:
-        said = f"RAW {type(error).__name__}: {str(error)[:200]}"
-    held = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    print(json.dumps(["done", name, said, held]), flush=True)
-"""
+
+def damaged(path: Path, whole: bytes, rng: np.random.Generator) -> bytes:
+    """The contents of a file, damaged as its type suggests."""
+    if rng.random() < 0.1 or not whole:
+        return damaged_bytes(whole or b"0", rng)
+    match path.suffix:
+        case ".json" | "":
+            return damaged_json(json.loads(whole), rng).encode()
+        case ".yaml":
+            return damaged_yaml(whole.decode(), rng)
+        case ".txt" | ".csv" | ".tsv" | ".obj" | ".ply":
+            if b"\0" in whole or rng.random() < 0.05:
+                long = b"x" * 140_000  # as long as no cell is
+                return damaged_bytes(whole, rng) if b"\0" in whole else long + whole
+            return damaged_words(whole.decode(), rng)
+        case ".glb" if rng.random() < 0.7:
+            return damaged_glb(whole, rng)
+        case ".npz" if rng.random() < 0.6:
+            return damaged_arrays(whole, rng)
+        case ".ckpt" if rng.random() < 0.6:
+            return damaged_tensors(whole, rng)
+        case ".prior" if rng.random() < 0.6:
+            return damaged_prior(whole, rng)
+        case _:
+            return damaged_bytes(whole, rng)
 
 
 def damaged_bytes(data: bytes, rng: np.random.Generator) -> bytes:
@@ -120,24 +125,107 @@ def damaged_json(data: Any, rng: np.random.Generator) -> str:
     return text[: rng.integers(len(text))] if rng.random() < 0.05 else text
 
 
-def assert_one_sentence(script: str, function: str, paths: Sequence[Path]) -> list[str]:
-    """Read files in a process with little memory: each is read, or refused in one sentence.
+def damaged_yaml(text: str, rng: np.random.Generator) -> bytes:
+    """With some values exchanged for odd ones, some lines moved."""
+    lines = text.splitlines()
+    for _ in range(int(rng.integers(1, 4))):
+        at, other = rng.integers(0, len(lines), 2)
+        key, colon, _ = lines[at].partition(":")
+        match int(rng.integers(4)):
+            case 0:
+                lines[at], lines[other] = lines[other], lines[at]
+            case 1:
+                lines[at] = "  " + lines[at]
+            case _:
+                lines[at] = f"{key}{colon} {ODD_YAML[rng.integers(len(ODD_YAML))]}"
+    return "\n".join(lines).encode()
 
-    Returns:
-        What was said of each file; "" where it was read.
-    """
-    told = subprocess.run(
-        [sys.executable, "-c", _READER, script, function, *map(str, paths)],
-        capture_output=True, text=True, timeout=MOST_S,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (MOST_BYTES, MOST_BYTES)),
-    )  # fmt: skip
-    lines = [json.loads(line) for line in told.stdout.splitlines() if line.startswith("[")]
-    assert told.returncode == 0, f"{lines[-1:]} ended it: {told.stderr[-2000:]}"
-    done = [line[1:] for line in lines if line[0] == "done"]
-    assert len(done) == len(paths)
-    for name, said, held in done:
-        assert not said.startswith("RAW"), f"{name}: {said}"
-        assert "\n" not in said and len(said) < 2500, f"{name}: {said[:3000]}"
-        assert held < MOST_RESIDENT, f"{name}: {held / 2**30:.1f} GiB"
-    return [said for _, said, _ in done]
+
+def damaged_glb(glb: bytes, rng: np.random.Generator) -> bytes:
+    """With damaged JSON, or damaged binary data, in chunks of the right lengths."""
+    length = struct.unpack("<I", glb[12:16])[0]
+    text, binary = glb[20 : 20 + length], glb[20 + length :]
+    if rng.random() < 0.6:
+        text = damaged_json(json.loads(text), rng).encode()
+    else:
+        binary = binary[:8] + damaged_bytes(binary[8:], rng)
+    text += b" " * (-len(text) % 4)
+    size = 20 + len(text) + len(binary)
+    return struct.pack("<5I", 0x46546C67, 2, size, len(text), 0x4E4F534A) + text + binary
+
+
+_ARRAYS = (
+    lambda a: a[:1], lambda a: a[..., :0], lambda a: a[:0], lambda a: a[None],
+    lambda a: a.astype(str), lambda a: a.astype(complex), lambda a: a * np.nan,
+    lambda a: a * 1e308 * 10, lambda a: a * 100, lambda a: -a, lambda a: a.ravel(),
+    lambda a: a.astype(bool), lambda a: a.sum(), lambda a: a.astype("datetime64[s]"),
+    lambda a: np.repeat(a, 20000, axis=0), lambda a: a.astype(np.int64) + 2**40,
+)  # fmt: skip
+
+
+def damaged_arrays(npz: bytes, rng: np.random.Generator) -> bytes:
+    """With another value, type or shape of an array; at times without one."""
+    with np.load(io.BytesIO(npz)) as file:
+        arrays = dict(file)
+    key = str(rng.choice(list(arrays)))
+    array = arrays[key]
+    if array.dtype.kind in "US":
+        arrays[key] = np.array(["x", "y"]) if rng.random() < 0.5 else np.array("\ud800x"[1:])
+    elif array.size < 5000 and np.ndim(array):
+        with np.errstate(all="ignore"):
+            arrays[key] = _ARRAYS[rng.integers(len(_ARRAYS))](array.astype(float))
+    else:
+        arrays[key] = array[..., :-1] if np.ndim(array) else array[None]
+    if rng.random() < 0.1:
+        del arrays[key]
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()
+
+
+def damaged_tensors(saved: bytes, rng: np.random.Generator) -> bytes:
+    """Other contents than `fit` writes, in a file that torch reads."""
+    import torch
+
+    data = torch.load(io.BytesIO(saved), weights_only=True)
+    odd: list[Any] = [
+        None, 3, -(2**40), [1, 2], "text", {}, {1: 2}, torch.zeros(2), torch.zeros(()), float("nan")
+    ]  # fmt: skip
+    value = odd[rng.integers(len(odd))]
+    found = [(box, key) for box, key in places(data) if isinstance(box, dict)]
+    kinds = sorted({str(key).split(".")[0] for _, key in found})
+    kind = kinds[rng.integers(len(kinds))]
+    same = [item for item in found if str(item[1]).split(".")[0] == kind]
+    container, key = same[rng.integers(len(same))]
+    if rng.random() < 0.2:
+        del container[key]
+    else:
+        container[key] = value
+    buffer = io.BytesIO()
+    torch.save(value if rng.random() < 0.05 else data, buffer)
+    return buffer.getvalue()
+
+
+def damaged_prior(packed: bytes, rng: np.random.Generator) -> bytes:
+    """A zip of the same names: one of its files is damaged, or a weight has other values."""
+    from safetensors.numpy import load, save
+
+    with zipfile.ZipFile(io.BytesIO(packed)) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    name = str(rng.choice(list(files)))
+    if name.endswith(".json"):
+        files[name] = damaged_json(json.loads(files[name]), rng).encode()
+    elif name.endswith(".safetensors") and rng.random() < 0.8:
+        tensors = load(files[name])
+        changed = tensors[str(rng.choice(list(tensors)))]
+        odd = [np.nan, -1e30, 1e30, 1e5, 0] if changed.dtype.kind == "f" else [-1, 99, 30_000]
+        with np.errstate(all="ignore"):
+            changed[...] = np.array(rng.choice(odd)).astype(changed.dtype)
+        files[name] = save(tensors)
+    else:
+        files[name] = damaged_bytes(files[name], rng)
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+    return buffer.getvalue()

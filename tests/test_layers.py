@@ -40,17 +40,17 @@ MAY_TOO = {
 }
 
 BUDGET = {
-    "data_prep": (12598, 59),
-    "sceneprior/core": (5669, 28),
+    "data_prep": (12616, 59),
+    "sceneprior/core": (5729, 28),
     "sceneprior/furniture": (588, 4),
     "sceneprior/render": (4490, 23),
-    "sceneprior/training": (884, 5),
-    "sceneprior/paper": (2405, 12),
+    "sceneprior/training": (931, 5),
+    "sceneprior/paper": (2406, 12),
     "sceneprior/lifted": (8174, 41),
     "sceneprior/baselines": (2909, 14),
-    "sceneprior/evaluation": (4466, 21),
+    "sceneprior/evaluation": (4558, 21),
     "sceneprior/interchange": (892, 5),
-    "sceneprior/apps": (6248, 34),
+    "sceneprior/apps": (6270, 34),
 }
 """Most lines and modules of a folder. They go down freely, and up only in a commit that says what
 it bought and what went for it."""
@@ -77,7 +77,7 @@ OWNERS = {
     "pydantic": [
         "sceneprior/core/", "sceneprior/training/", "sceneprior/paper/", "sceneprior/lifted/",
         "sceneprior/baselines/", "sceneprior/apps/decoders.py", "sceneprior/apps/experiments/",
-        "data_prep/",
+        "sceneprior/evaluation/", "data_prep/",
     ],
     "typer": ["sceneprior/apps/cli/", "data_prep/cli.py"],
     "jinja2": ["sceneprior/evaluation/"],

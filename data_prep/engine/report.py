@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from pydantic import BaseModel
 from rich.table import Column, Table
 from rich.text import Text
 
@@ -26,6 +27,12 @@ _SHOWN = 10
 _COUNTS = ("rooms", "views", "objects")
 _MEANS = ("views_per_room", "objects_per_room", "objects_per_view")
 _COLUMNS = ("room_id", "house", "split", "status", "rule", "reason", "views", "objects", "notes")
+
+
+class Report(BaseModel):
+    """The entries of `report.json` that are read again."""
+
+    rooms: list[Line]
 
 
 def line_of(result: PreparedRoom | Line, task: RoomTask, label_set_name: str) -> Line:

@@ -13,6 +13,7 @@ import numpy as np
 
 from data_prep.inspection.agreement import Room, compare, score
 from sceneprior.core.cameras import camera_centers, pixel_rays
+from sceneprior.core.checked import number_array
 
 FOCAL_STEPS = tuple(k for k in range(-8, 9) if k)
 """Powers of 2^(1/6) = 1.12 by which focal lengths are scaled: 0.4 to 2.5."""
@@ -80,7 +81,7 @@ class Convention(NamedTuple):
         usual = _OF_SOURCE.get(source, cls())
         if file is None:
             return usual
-        world = np.array(room_from_world, dtype=np.float64).reshape(4, 4)
+        world = number_array(room_from_world).reshape(4, 4)
         if Path(file).name in ("cameras.bin", "cameras.txt"):
             name = f"COLMAP's {Path(file).parent.as_posix()}"
             return usual._replace(file=name, reading=W2C, axes=OPENCV, room_from_world=world)

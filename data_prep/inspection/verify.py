@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from data_prep.engine.plan import in_words
-from data_prep.engine.report import REPORT_NAME, without_class
-from data_prep.engine.source import Line, pool
+from data_prep.engine.report import REPORT_NAME, Report, without_class
+from data_prep.engine.source import pool
 from data_prep.inspection.agreement import (
     Agreement,
     Limits,
@@ -22,6 +22,7 @@ from data_prep.inspection.agreement import (
 from data_prep.inspection.causes import Convention
 from data_prep.inspection.diagnosis import Finding, disagreement, find_mistake, outliers
 from data_prep.inspection.evidence import Evidence, room_evidence, total
+from sceneprior.core.checked import checked
 from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
@@ -94,7 +95,7 @@ def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> Folder
     """
     folder = Path(folder)
     index = read_index(folder)
-    name, source = str(index.get("label_set")), str(index.get("source"))
+    name, source = index["label_set"], str(index.get("source"))
     label_set(name)
     usual, conventions, failures, unknown = read_conventions(folder, source)
     problems = [f"{folder}: {failures}."] if failures and room_id is None else []
@@ -135,13 +136,13 @@ def read_conventions(
     """
     usual = Convention.stated(source)
     try:
-        lines = [Line(**line) for line in read_json(folder / REPORT_NAME)["rooms"]]
+        lines = checked(Report, read_json(folder / REPORT_NAME), REPORT_NAME).rooms
         rooms = {
             line.room_id: Convention.stated(source, **line.cameras)
             for line in lines
             if line.cameras
         }
-    except (InputError, KeyError, TypeError, ValueError):
+    except (InputError, TypeError, ValueError):
         return usual, {}, None, []
     failed = [line for line in lines if line.status == "failed"]
     prepared = sum(line.status == "prepared" for line in lines)
@@ -210,12 +211,11 @@ def _mistakes_in_3d(folder: Path, rooms: Sequence[RoomCheck]) -> list[str]:
 def _count_problems(
     folder: Path, index: dict[str, Any], rooms: dict[str, list[RoomCheck]]
 ) -> Iterator[str]:
-    counts = index.get("counts")
-    for split, expected in counts.items() if isinstance(counts, dict) else ():
+    for split, expected in index.get("counts", {}).items():
         checks = [room for room in rooms.get(split, ()) if room.room_id]
         views, objects = (sum(getattr(room, of) for room in checks) for of in ("views", "objects"))
         for what, count in {"rooms": len(checks), "views": views, "objects": objects}.items():
-            if expected.get(what, count) != count:
+            if expected[what] != count:
                 yield (
                     f"{folder}: index.json counts {expected[what]} {what} in '{split}', but its "
                     f"shards hold {count}; run the same prep command again."

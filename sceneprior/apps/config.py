@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from sceneprior.apps.priors.packed import find_prior, is_packed, read_packed, unpack
-from sceneprior.core.errors import ConfigError, InputError
-from sceneprior.core.settings import check_settings, read_settings, shortened
+from sceneprior.core.errors import ConfigError, InputError, shortened
+from sceneprior.core.settings import check_settings, read_settings
 from sceneprior.paper.prior import TrainedPrior
 from sceneprior.training.method import (
     RunConfig,

@@ -1,12 +1,18 @@
-"""Validates plain data from files against models."""
+"""Validates what is read from files: plain data against models, and arrays in caches."""
 
+import contextlib
+import hashlib
+import io
 import reprlib
+import warnings
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
-from sceneprior.core.errors import InputError
+from sceneprior.core.errors import InputError, InputWarning
+from sceneprior.core.files import read_arrays, write_whole
 
 _M = TypeVar("_M", bound=BaseModel)
 _LONGEST = 60
@@ -23,26 +29,58 @@ _REPR = _Repr()
 _REPR.maxstring = _LONGEST
 
 
-def checked(model: type[_M], data: Any, where: str) -> _M:
-    """Validate parsed JSON against a Pydantic model."""
+def checked(model: type[_M], data: Any, where: str, hint: str = "") -> _M:
+    """Validate parsed JSON against a Pydantic model; `hint` says what to do if it is another."""
     try:
         return model.model_validate(data)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         if first["type"] == "value_error":
             raise InputError(f"{where}: {first['ctx']['error']}") from None
-        raise InputError(f"{where}: {fault_of(error)}.") from None
+        raise InputError(f"{where}: {fault_of(error)}{'; ' if hint else ''}{hint}.") from None
 
 
 def fault_of(error: ValidationError) -> str:
     """Describe the first fault: the key, its value, and what was expected."""
     first = error.errors(include_url=False)[0]
-    key, reason = ".".join(map(str, first["loc"])) or "it", first["msg"]
+    key, reason = plain(".".join(map(str, first["loc"])), 200) or "it", first["msg"]
     if first["type"] == "missing":  # its input is the whole object without the key
         return f"{key} is missing"
     if first["type"] == "model_type":  # Pydantic's message names our class
         reason = "expected a JSON object"
     return f"{key} is {shown(first['input'])}; {reason[:1].lower()}{reason[1:]}"
+
+
+def keep_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Write arrays to a cache, an .npz with their digest, from which `kept_arrays` reads them."""
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, sha256=np.array(_digest(arrays)), **arrays)
+    write_whole(path, buffer.getvalue())
+
+
+def kept_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Read the arrays of `keep_arrays`; none if the file is missing, or other than it was written,
+    which a warning says."""
+    if not path.is_file():
+        return {}
+    with contextlib.suppress(InputError):
+        arrays = read_arrays(path)
+        if str(arrays.pop("sha256", "")) == _digest(arrays):
+            return arrays
+    warnings.warn(
+        f"{path} is damaged, or of an earlier release; it is made again.",
+        InputWarning,
+        stacklevel=2,
+    )
+    return {}
+
+
+def _digest(arrays: dict[str, np.ndarray]) -> str:
+    summary = hashlib.sha256()
+    for name, array in sorted(arrays.items()):
+        summary.update(f"{name} {array.dtype} {array.shape}".encode())
+        summary.update(array.tobytes())
+    return summary.hexdigest()
 
 
 def number_array(value: Any) -> np.ndarray:

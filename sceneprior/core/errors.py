@@ -29,13 +29,29 @@ _ADVICE = {
 """Advice on operating system errors, by number."""
 _ELSEWHERE = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.ENOENT}
 """Errors after which the user may also write to another folder."""
+_LONGEST_SENTENCE = 2000
+
+
+def shortened(said: object, longest: int = 500) -> str:
+    """Put a text on one line; cut out the middle of a long text.
+
+    >>> shortened("a" * 60, longest=20)
+    'aaaaaaaaaa ... aaaa'
+    """
+    text = " ".join(str(said).split())
+    return text if len(text) <= longest else f"{text[: longest // 2]} ... {text[-longest // 5 :]}"
 
 
 class InputError(ValueError):
     """The user's input cannot be used; the message is self-contained.
 
-    The CLI prints the message and exits with status 2, without a traceback.
+    The CLI prints the message and exits with status 2, without a traceback. A message is cut if it
+    quotes too much of the input.
     """
+
+    def __init__(self, sentence: str = ""):
+        long = len(sentence) > _LONGEST_SENTENCE
+        super().__init__(shortened(sentence, _LONGEST_SENTENCE) if long else sentence)
 
 
 class ShardError(InputError):
@@ -67,6 +83,6 @@ def sentence_of(error: Exception) -> str | None:
 def cause_of(error: Exception) -> str:
     """Why a file cannot be read, and what to do: 'Permission denied: change its permissions'."""
     if not isinstance(error, OSError) or error.errno is None:
-        return " ".join(str(error).split())[:200] or type(error).__name__
+        return shortened(error, 300) or type(error).__name__
     advice = _ADVICE.get(error.errno) if error.errno != errno.ENOENT else None
     return os.strerror(error.errno) + (f": {advice}" if advice else "")

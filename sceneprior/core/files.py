@@ -250,7 +250,11 @@ def read_text(path: Path, most: int = _MOST_TEXT, hint: str = "") -> str:
 def read_json(path: Path, most: int = _MOST_TEXT, hint: str = "") -> Any:
     """Read a JSON file."""
     try:
-        return json.loads(read_bytes(path, most, hint))
+        content = read_bytes(path, most, hint)
+        found = json.loads(content)
+        if b"\\ud" in content or b"\\uD" in content:  # half a character could not be written
+            json.dumps(found, ensure_ascii=False).encode()
+        return found
     except InputError:
         raise
     except (ValueError, RecursionError) as error:
@@ -289,7 +293,7 @@ def read_arrays(path: Path, hint: str = "", only: Collection[str] = ()) -> dict[
     except OSError as error:
         raise _unread(path, cause_of(error), hint) from None
     except Exception as error:  # NumPy parses headers as Python: the type depends on the damage
-        reason = ascii(" ".join(str(error).split())[:120])[1:-1] or type(error).__name__
+        reason = ascii(cause_of(error))[1:-1]
         if "pickle" in reason:  # NumPy says how to load it all the same
             reason = "it holds no arrays, or Python objects"
         raise _unread(path, reason, hint) from None

@@ -8,9 +8,9 @@ import numpy as np
 import shapely
 from pydantic import BaseModel, ConfigDict, Field
 
-from sceneprior.core.checked import checked
+from sceneprior.core.checked import checked, shown
 from sceneprior.core.classes import label_set
-from sceneprior.core.errors import InputError
+from sceneprior.core.errors import InputError, shortened
 from sceneprior.core.files import json_text, read_json
 from sceneprior.core.scene import Opening, Scene, SceneObject, Solid, Turned, bound_m
 
@@ -133,7 +133,7 @@ def read_scene(path: Path) -> Scene:
         raise InputError(f"{where}: expected an object with 'format', 'version' and 'objects'.")
     if (data["format"], data["version"]) != (FORMAT, VERSION):
         raise InputError(
-            f"{path} says format '{_short(data['format'])}' version {_short(data['version'])}; "
+            f"{path} says format {shown(data['format'])} version {shown(data['version'])}; "
             f"expected '{FORMAT}' version {VERSION}. Write it again with `sceneprior synthesize`."
         )
     entry = checked(_SceneEntry, data, where)
@@ -145,8 +145,8 @@ def read_scene(path: Path) -> Scene:
     for item in entry.objects:
         if item.label not in names:
             raise InputError(
-                f"{path}: class '{_short(item.label)}' is not in label set "
-                f"'{_short(entry.label_set)}'; use one of {', '.join(names)}."
+                f"{path}: class '{shortened(item.label, 60)}' is not in label set "
+                f"'{shortened(entry.label_set, 60)}'; use one of {', '.join(names)}."
             )
     objects = [read_object(path, item) for item in entry.objects]
     floor = None if entry.floor_m is None else np.array(entry.floor_m, dtype=np.float64)
@@ -256,8 +256,3 @@ def unit_guess(numbers: Any) -> str:
     """Question about the unit, for messages about lengths that are too large for metres."""
     unit = "millimetres" if np.abs(numbers).max() > 1000 else "centimetres"
     return f"Are these {unit}? Give metres."
-
-
-def _short(text: object) -> str:
-    """Shorten a value from a file for a message."""
-    return str(text)[:60]

@@ -10,7 +10,7 @@ from typing import Any, TypeVar, get_args
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from sceneprior.core.errors import ConfigError
+from sceneprior.core.errors import ConfigError, shortened
 from sceneprior.core.files import read_text, write_whole
 
 MOST_BYTES = 2**20
@@ -31,7 +31,6 @@ _Loader.add_implicit_resolver(
 CONFIG_FOLDERS = ("", "paper", "lifted", "baselines", "compare")
 """Folders of `configs/`, in the order in which a bare name is looked up."""
 
-_LONGEST = 500
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel = 2
 _SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 120
@@ -93,12 +92,6 @@ def read_yaml(path: Path) -> dict[str, Any]:
     if not isinstance(data, dict):
         raise ConfigError(f"{path} holds no settings; expected `section:` and `key: value` lines.")
     return data
-
-
-def shortened(said: object) -> str:
-    """Put a text on one line; cut out the middle of a long text."""
-    text = " ".join(str(said).split())
-    return text if len(text) <= _LONGEST else f"{text[: _LONGEST // 2]} ... {text[-100:]}"
 
 
 def check_settings(model: type[_S], data: dict[str, Any], source: str) -> _S:

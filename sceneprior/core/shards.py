@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from pydantic import BaseModel
 from zlib_ng import zlib_ng
 
+from sceneprior.core.checked import checked
 from sceneprior.core.classes import STUFF, label_set
-from sceneprior.core.errors import ShardError
+from sceneprior.core.errors import ShardError, shortened
 from sceneprior.core.files import is_name, list_files, open_hdf5, read_json, reading
 from sceneprior.core.observations import RoomGroundTruth, RoomViews, stuff_size, thinned
 
@@ -70,9 +72,9 @@ class Shard(contextlib.AbstractContextManager["Shard"]):
             if form != FORMAT or version not in READABLE:
                 self._file.close()
                 raise ShardError(
-                    f"{path} says format '{_short(form)}' version {_short(version)}, expected "
-                    f"'{FORMAT}' version 1 or {VERSION}. Prepare the data again with this "
-                    f"release's {PREPARE}."
+                    f"{path} says format '{shortened(form, 60)}' version "
+                    f"{shortened(version, 60)}, expected '{FORMAT}' version 1 "
+                    f"or {VERSION}. Prepare the data again with this release's {PREPARE}."
                 )
             self.label_set = _text(self._file.attrs, "label_set")
             self._classes = len(label_set(self.label_set))
@@ -249,10 +251,6 @@ def _decoded(value: Any) -> Any:
     return value.decode() if isinstance(value, bytes) else value
 
 
-def _short(value: Any) -> str:
-    return " ".join(str(value).split())[:60]
-
-
 def _text(attributes: Any, name: str) -> str:
     value = _decoded(attributes[name])
     if not isinstance(value, str) or not value.isprintable():
@@ -300,6 +298,20 @@ def iterate_rooms(folder: Path, split: str) -> Iterator[tuple[Shard, str]]:
                 yield shard, room_id
 
 
+class _Counts(BaseModel):
+    rooms: int
+    views: int
+    objects: int
+
+
+class _Index(BaseModel):
+    """The contents of an `index.json`, as `prep-*` and `make-homes` write it last."""
+
+    label_set: str
+    source: str = ""
+    counts: dict[str, _Counts] = {}
+
+
 def read_index(folder: Path) -> dict[str, Any]:
     """Read a folder's `index.json`: label set, room type, counts and recipe."""
     path = Path(folder) / INDEX_NAME
@@ -308,4 +320,6 @@ def read_index(folder: Path) -> dict[str, Any]:
             f"{folder} has no {INDEX_NAME}; it is not a finished folder of shards. "
             f"Run {PREPARE} to its end."
         )
-    return read_json(path, hint=f"prepare {folder} again")
+    index = read_json(path, hint=(hint := f"prepare {folder} again"))
+    checked(_Index, index, str(path), hint)
+    return index

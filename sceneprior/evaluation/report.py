@@ -1,5 +1,6 @@
 """The report page of a run or of a folder of scenes: rooms, scores and curves in one HTML file."""
 
+import contextlib
 import io
 import json
 import string
@@ -134,7 +135,16 @@ _TILES = (
 
 
 class _Tile(string.Formatter):
+    """Formats numbers; what a result does not have is a dash."""
+
+    def get_field(self, field_name: str, args: Any, kwargs: Any) -> Any:
+        with contextlib.suppress(LookupError, TypeError):
+            return super().get_field(field_name, args, kwargs)
+        return None, field_name
+
     def format_field(self, value: Any, format_spec: str) -> Any:
+        if not isinstance(value, int | float):
+            return "–"
         return percent(value) if format_spec == "%" else super().format_field(value, format_spec)
 
 

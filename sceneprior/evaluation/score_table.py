@@ -1,13 +1,19 @@
-"""The table of an evaluation result, as rows of text for pages and printed in the terminal."""
+"""An evaluation result: its schema, and its table as rows of text, for pages and printed."""
 
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
+from pydantic import BaseModel, ConfigDict, Field
 from rich import box
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from sceneprior.core.checked import checked
+from sceneprior.core.files import read_json
 from sceneprior.evaluation.metrics import METRICS, USE
+
+FORMAT = "sceneprior-scores"
 
 WIDTH = 150
 """Width in characters of a table written to a file; narrower tables fold intervals."""
@@ -23,11 +29,50 @@ COLUMNS = {
 """Headings by set of rooms. The protocol counts the rooms of a set under `n_<set>`; a set without
 such a count has no column."""
 
-
 RELATION_HEADINGS = (
     "an object", "and the nearest", "distance of gaps, m", "real training, m",
     "within 0.3 m", "real test",
 )  # fmt: skip
+
+
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+
+
+class _Relation(BaseModel):
+    of: str
+    to: str
+    distance_m: Number
+    train_m: Number
+    near: Number | None
+    near_test: Number | None
+
+
+class Scores(BaseModel):
+    """The contents of a result file, as `evaluate_synthesis` describes them.
+
+    The metrics of generated and test rooms are by key, and those of other sets by set and key.
+    """
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, Number | None]
+    format: Literal["sceneprior-scores"]
+    version: int
+    decoded_rooms: dict[str, Number | None] = {}
+    train_rooms: dict[str, Number | None] = {}
+    shuffled: dict[str, Number | None] = {}
+    independent: dict[str, Number | None] = {}
+    independent_meshes: dict[str, Number | None] = {}
+    intervals: dict[str, dict[str, tuple[Number, Number] | None]]
+    relations: list[_Relation] = []
+    note: str = ""
+    protocol: dict[str, Any]
+
+
+def read_scores(path: Path, hint: str) -> dict[str, Any]:
+    """Read a result file; `hint` says how it is written."""
+    found = read_json(path, hint=hint)
+    checked(Scores, found, f"{path} holds no scores", hint)
+    return found
 
 
 def score_rows(scores: dict[str, Any]) -> list[tuple[str, ...]]:

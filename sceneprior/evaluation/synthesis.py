@@ -41,8 +41,8 @@ from sceneprior.evaluation.metrics.contents import (
 from sceneprior.evaluation.metrics.layouts import FEW_TEST_ROOMS, furthest_pairs
 from sceneprior.evaluation.metrics.novelty import near_copy_threshold
 from sceneprior.evaluation.metrics.picture_classifiers import ALEXNET, alexnet_weights
+from sceneprior.evaluation.score_table import FORMAT
 
-FORMAT = "sceneprior-scores"
 VERSION = 4
 """Version of the result file. Version 3 had a weaker layout classifier, compared the pictures of
 all generated rooms, and required a near copy to have exactly the same objects. Version 2 set the

@@ -8,12 +8,14 @@ import numpy as np
 import shapely
 import trimesh
 from jaxtyping import Float
+from pydantic import BaseModel, ConfigDict
 
 from sceneprior.core.boxes import box_iou_3d
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Mesh, SceneObject
 from sceneprior.core.surfaces import chamfer_of, nearest_distances
 from sceneprior.evaluation.metric import COVERAGE, ratio, resample_counts
+from sceneprior.evaluation.score_table import Number
 from sceneprior.render.appearance import object_mesh
 
 POINTS = 10_000
@@ -21,6 +23,41 @@ POINTS = 10_000
 (`ChamferSum.l2_m`) of 35 mm; with 1,000 points, 112 mm."""
 F_THRESHOLD_M = 0.05
 """Distance to the other surface up to which a point counts as correct for the F-score."""
+
+
+class _Summary(BaseModel):
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, Number | None]
+    objects: int
+    with_surface: int
+    images: int
+    rooms: int
+
+
+class _ViewsRow(BaseModel):
+    summary: _Summary
+    intervals: dict[str, tuple[Number, Number] | None]
+
+
+class _ViewsRows(BaseModel):
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, _ViewsRow]
+    fit: _ViewsRow
+    nearest_room: _ViewsRow
+    random_room: _ViewsRow
+
+
+class _ViewsProtocol(BaseModel):
+    shards: str
+    known_model_share: Number | None
+
+
+class ViewScores(BaseModel):
+    """The contents of a result file of `eval-svr`."""
+
+    rows: _ViewsRows
+    cpu_seconds_an_image: Number
+    protocol: _ViewsProtocol
 
 
 def sample_surface(mesh: Mesh, count: int, seed: int) -> Float[np.ndarray, "count 3"]:
@@ -56,16 +93,17 @@ def f_score(
 
 def upright_box_iou_3d(a: Mesh, b: Mesh) -> float:
     """Intersection over union of the tightest upright boxes around two meshes, each over the
-    footprint's rectangle of least area; 0 for boxes without volume.
+        footprint's rectangle of least area; 0 for boxes without volume.
 
-    Example: a cube and the same cube turned by 45 degrees share a regular octagon.
+        Example: a cube and the same cube turned by 45 degrees share a regular octagon.
 
-        >>> from sceneprior.core.boxes import yaw_rotation
-        >>> from sceneprior.render.appearance import box_mesh
-        >>> cube = box_mesh((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
-        >>> turned = Mesh(cube.vertices_m @ yaw_rotation(np.pi / 4), cube.faces)
-        >>> round(upright_box_iou_3d(cube, turned), 6)
-        0.707107
+            >>> from sceneprior.core.boxes import yaw_rotation
+            >>> from sceneprior.evaluation.score_table import Number
+    from sceneprior.render.appearance import box_mesh
+            >>> cube = box_mesh((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+            >>> turned = Mesh(cube.vertices_m @ yaw_rotation(np.pi / 4), cube.faces)
+            >>> round(upright_box_iou_3d(cube, turned), 6)
+            0.707107
     """
     points = [np.asarray(mesh.vertices_m, dtype=np.float64) for mesh in (a, b)]
     plans = [shapely.MultiPoint(each[:, ::2]).minimum_rotated_rectangle for each in points]

@@ -199,7 +199,8 @@ def read_latent(trained: TrainedPrior, text: str) -> Float[Tensor, " dimension"]
         return named_latent(trained, text, "a file of latents (.npz)")
     hint = "expected (n, D) numbers, as in the latents.npz that `sceneprior synthesize` writes"
     data = read_arrays(path, hint, ("latents", "names"))
-    latents, names = data.get("latents", np.zeros(0)), [*map(str, data.get("names", []))]
+    latents = data.get("latents", np.zeros(0))
+    names = [*map(str, np.ravel(data.get("names", [])))]
     if latents.ndim != 2 or not latents.size or latents.dtype.kind not in "iuf":
         came = f"{latents.dtype} of shape {latents.shape}" if "latents" in data else "none"
         raise InputError(f"{path} holds no latents ({came}); {hint}.")

@@ -21,6 +21,7 @@ from torch import nn
 
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import write_whole
+from sceneprior.core.repeatable import LARGEST_SEED
 from sceneprior.training.method import read_checkpoint
 from sceneprior.training.steps import batch_seed
 
@@ -85,13 +86,14 @@ class RollingCheckpoint(Callback):
     """
 
     def __init__(self, folder: Path, extra: dict):
-        self.folder, self.extra = folder, extra
+        self.folder, self.extra, self.written = folder, extra, False
 
     def on_save_checkpoint(self, trainer, pl_module, checkpoint: dict) -> None:
         checkpoint.update(self.extra)
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, pl_module) -> None:
         write_checkpoint(trainer, self.folder, "last.ckpt")
+        self.written = True
 
 
 def write_checkpoint(trainer: lightning.Trainer, folder: Path, name: str) -> None:
@@ -111,11 +113,25 @@ def check_resumable(path: Path, module: nn.Module) -> None:
     shapes = {name: getattr(value, "shape", None) for name, value in saved["state_dict"].items()}
     expected = {name: value.shape for name, value in module.state_dict().items()}
     if missing or shapes != expected:
-        reason = f"it has no {missing[0]}" if missing else "its tensors are of another network"
-        raise InputError(
-            f"Training cannot be resumed from {path}: {reason}. Delete it, and the same command "
-            "trains the stage from its start."
+        raise not_resumed(
+            path, f"it has no {missing[0]}" if missing else "its tensors are of another network"
         )
+    if not _counts_up([saved["loops"], saved["epoch"], saved["global_step"]]):
+        raise not_resumed(path, "its counts of steps are no numbers, or negative")
+
+
+def not_resumed(path: Path, reason: str) -> InputError:
+    """The error of a checkpoint from which no training can be resumed."""
+    return InputError(
+        f"Training cannot be resumed from {path}: {reason}. Delete it, and the same command "
+        "trains the stage from its start."
+    )
+
+
+def _counts_up(counts: Any) -> bool:
+    if isinstance(counts, dict | list):
+        return all(map(_counts_up, counts.values() if isinstance(counts, dict) else counts))
+    return isinstance(counts, int) and 0 <= counts < LARGEST_SEED
 
 
 def first_process() -> bool:

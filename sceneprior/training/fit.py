@@ -1,7 +1,6 @@
 """Train the stages of a run, one after the other, with Lightning."""
 
 import contextlib
-import csv
 import logging
 import os
 import signal
@@ -16,7 +15,7 @@ import torch
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 
 from sceneprior.core.checked import shown
-from sceneprior.core.errors import ConfigError, InputError, InputWarning
+from sceneprior.core.errors import ConfigError, InputError, InputWarning, cause_of
 from sceneprior.core.files import only_writer, read_json, remove_parts
 from sceneprior.core.settings import check_settings, dump_settings, read_settings
 from sceneprior.training.callbacks import (
@@ -25,11 +24,18 @@ from sceneprior.training.callbacks import (
     StepSeed,
     check_resumable,
     first_process,
+    not_resumed,
     requeue_on_signal,
     slurm_plugins,
     write_checkpoint,
 )
-from sceneprior.training.method import RunConfig, Stage, read_checkpoint, without_samples
+from sceneprior.training.method import (
+    RunConfig,
+    Stage,
+    read_checkpoint,
+    read_metrics,
+    without_samples,
+)
 from sceneprior.training.steps import make_loader
 
 LOGGERS = ("csv", "tensorboard", "wandb")
@@ -133,9 +139,10 @@ def _train(
     pairs_no_room = latents is not None and not len(latents.weight)  # the table is empty
     room_ids = [] if pairs_no_room else [*rooms.room_ids]
     said = {"sceneprior": {"room_ids": room_ids, "label_set": config.label_set}}
+    rolling = RollingCheckpoint(folder, said)
     callbacks = [
-        RunProgress(f"fit {stage.name} (epochs)"), StepSeed(config.seed),
-        RollingCheckpoint(folder, said), *options.pop("callbacks", ()),
+        RunProgress(f"fit {stage.name} (epochs)"), StepSeed(config.seed), rolling,
+        *options.pop("callbacks", ()),
     ]  # fmt: skip
     # Lightning's hints are silenced; GPUs that can multiply matrices fast (TF32) may do so.
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
@@ -164,8 +171,7 @@ def _train(
         )
     except (ValueError, TypeError, RuntimeError) as error:
         given = ", ".join(f"--{name} {value}" for name, value in options.items())
-        reason = " ".join(str(error).split())
-        raise InputError(f"Lightning cannot train with {given}: {reason}") from None
+        raise InputError(f"Lightning cannot train with {given}: {cause_of(error)}") from None
     if stage.steps_itself and trainer.world_size > 1:
         raise InputError(
             f"method: {config.method} trains in one process, but {trainer.world_size} were "
@@ -195,6 +201,14 @@ def _train(
             raise
         signal.signal(signal.SIGINT, before)  # Lightning leaves it ignored
         raise KeyboardInterrupt from None
+    except (
+        TypeError, ValueError, LookupError, AttributeError, ArithmeticError, RuntimeError
+    ) as error:  # fmt: skip
+        # What is wrong in a checkpoint may show as late as in its first step or epoch.
+        own = isinstance(error, InputError | FloatingPointError | torch.OutOfMemoryError)
+        if start is None or rolling.written or own:
+            raise
+        raise not_resumed(start, f"{type(error).__name__}: {cause_of(error)}") from None
     write_checkpoint(trainer, folder, "final.ckpt")
 
 
@@ -225,7 +239,7 @@ def make_logger(name: str, folder: Path) -> Logger:
     if name == "csv":
         # Lightning's CSVLogger deletes an existing file, so it is given the rows of earlier epochs.
         path = folder / "metrics.csv"
-        before = list(csv.DictReader(path.read_text().splitlines())) if path.is_file() else []
+        before = read_metrics(path)
         logger = CSVLogger(folder, name="", version="")
         if before and first_process():
             logger.experiment.metrics.extend(before)

@@ -11,6 +11,7 @@ RUN/<stage>/final.ckpt     the finished stage, which commands load
 RUN/<stage>/metrics.csv    one line per epoch; TensorBoard's files are in the same folder
 """
 
+import contextlib
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -23,11 +24,11 @@ from pydantic import Field, model_validator
 from torch import nn
 
 from sceneprior.core.classes import label_set
-from sceneprior.core.errors import ConfigError, InputError
-from sceneprior.core.files import check_file, reading
+from sceneprior.core.errors import ConfigError, InputError, cause_of, shortened
+from sceneprior.core.files import check_file, read_table, reading
 from sceneprior.core.repeatable import LARGEST_SEED
 from sceneprior.core.scene import Mesh
-from sceneprior.core.settings import Section, shortened
+from sceneprior.core.settings import Section
 from sceneprior.core.shards import Shard, list_shards
 from sceneprior.core.views import RoomBoxes, SceneViews
 
@@ -182,10 +183,9 @@ class RunConfig(Section, ABC):
         except InputError:
             raise
         except Exception as error:  # the error depends on where the wrong part is first used
-            reason = " ".join(str(error).split())[:200]
             raise InputError(
-                f"{path} does not fit the run's config.yaml ({reason}); use the config it was "
-                "trained with."
+                f"{path} does not fit the run's config.yaml ({cause_of(error)}); use the "
+                "config it was trained with."
             ) from None
         return self.trained(networks, stage, room_ids)
 
@@ -317,6 +317,18 @@ def find_checkpoint(run: Path, stages: Sequence[str]) -> tuple[str, Path]:
         f"{run} holds no checkpoint yet; continue its training with `sceneprior fit --config "
         f"{run / 'config.yaml'} --run {run} --resume`."
     )
+
+
+def read_metrics(path: Path) -> list[dict[str, str]]:
+    """Rows of a stage's metrics.csv, if any, by column; a row cut off by a kill is left out."""
+    header, *rows = (read_table(path) if path.is_file() else []) or [[]]
+    found = []
+    for row in rows:
+        with contextlib.suppress(LookupError, ValueError, OverflowError):
+            cells = dict(zip(header, row, strict=True))
+            int(cells["epoch"]), [float(cell or 0) for cell in row]
+            found.append(cells)
+    return found
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

@@ -145,7 +145,9 @@ CASES: dict[str, Callable[[Path], object]] = {
     "shards no folder": lambda folder: list_shards(folder / "none", "train"),
     "shards no index": read_index,
     "shards no index for a split": lambda folder: list_shards(folder, "test"),
-    "shards of no split": text("index.json", "{}", lambda path: list_shards(path.parent, "test")),
+    "shards of no split": text(
+        "index.json", '{"label_set": ""}', lambda path: list_shards(path.parent, "test")
+    ),
     "shards index cut": text("index.json", '{"a"', lambda path: read_index(path.parent)),
 }
 

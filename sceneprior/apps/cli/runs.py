@@ -139,15 +139,18 @@ def pack(
     from sceneprior.apps.priors.card import model_card
     from sceneprior.apps.priors.packed import pack as packed_of
     from sceneprior.apps.priors.packed import write_packed
-    from sceneprior.core.files import read_bytes, read_json
+    from sceneprior.core.files import read_bytes
+    from sceneprior.evaluation.score_table import read_scores
     from sceneprior.lifted.config import SAMPLER
     from sceneprior.paper.prior import TrainedPrior
 
     if out.exists() and (out.is_dir() or not overwrite):
         raise InputError(f"{out} already exists; name another file, or add --overwrite.")
     found = scores or run / "scores.json"
-    measured = read_json(found) if scores is not None or found.is_file() else None
-    stated = None if about is None else read_bytes(about).decode(errors="replace")
+    measured = None
+    if scores is not None or found.is_file():
+        measured = read_scores(found, f"write them with `sceneprior eval-fid --run {run}`")
+    stated = None if about is None else read_bytes(about).decode("utf-8-sig", "replace")
     run_config(run)
     trained = load_any_run(run)
     card = model_card(trained, out.stem, stated, measured, latents, half)

@@ -21,8 +21,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from pydantic import BaseModel, RootModel
 
 from sceneprior.apps.config import load_config
+from sceneprior.core.checked import checked
 from sceneprior.core.errors import InputError, sentence_of
 from sceneprior.core.files import only_writer, read_json, write_json
 
@@ -132,29 +134,43 @@ def costs() -> dict[str, float]:
     return {"cpu_s": cpu_s, "wall_s": time.monotonic()}
 
 
+class _Entry(BaseModel):
+    arguments: list[str] = []
+    depends_on: list[str] = []
+    cpu_s: float | None = None
+    wall_s: float | None = None
+    finished: bool = False
+
+
+class _Journal(RootModel[dict[str, _Entry]]):
+    """The contents of `steps.json`, by command."""
+
+
 def read_journal(folder: Path) -> dict[str, Any]:
     """Entries of `steps.json` by command; empty if nothing has run."""
     path = folder / "steps.json"
-    return read_result(path) if path.is_file() else {}
+    return read_result(path, _Journal) if path.is_file() else {}
 
 
-def read_result(path: Path) -> dict[str, Any]:
+def read_result(path: Path, schema: type[BaseModel]) -> dict[str, Any]:
     """The contents of a JSON file that a command wrote."""
     try:
-        return dict(read_json(path))
-    except (InputError, TypeError, ValueError):
+        found: dict[str, Any] = read_json(path)
+        checked(schema, found, str(path))
+    except InputError:
         raise InputError(
             f"{path} is damaged; delete it and run the same command again: training is kept."
         ) from None
+    return found
 
 
 def finished_commands(folder: Path) -> tuple[list[str], float | None]:
     """The finished commands of `steps.json`, as they are typed, and the seconds that they took;
     None if one was killed, or nothing has run."""
     finished = [entry for entry in read_journal(folder).values() if entry.get("finished")]
-    seconds = [entry["wall_s"] for entry in finished]
+    seconds = [entry.get("wall_s") for entry in finished]
     known = seconds and None not in seconds
-    typed = [f"sceneprior {shlex.join(entry['arguments'])}" for entry in finished]
+    typed = [f"sceneprior {shlex.join(entry.get('arguments', []))}" for entry in finished]
     return typed, sum(seconds) if known else None
 
 
@@ -169,7 +185,7 @@ def run_demo(out: Path, config: str, rooms: int, count: int, main: Main) -> None
     with running_commands(out):
         for command in demo_commands(out, config, rooms, count):
             if is_done(command, out):
-                took = read_journal(out)[command.name]["wall_s"]
+                took = read_journal(out)[command.name].get("wall_s")
                 seconds = "" if took is None else f", {took:.0f} s"
                 print(f"{command.name}: done before{seconds}", file=sys.stderr)
                 continue

@@ -1,6 +1,5 @@
 """Write the report page of a run, or of a folder of the user's scenes."""
 
-import csv
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +10,14 @@ from sceneprior.apps.experiments.commands import finished_commands
 from sceneprior.apps.experiments.comparison import GIVEN, made_by_run
 from sceneprior.apps.experiments.evaluate import decoded_and_true
 from sceneprior.apps.sample import sample_rooms
-from sceneprior.core.errors import InputError
-from sceneprior.core.files import read_json
 from sceneprior.core.ground_truth import known_in_3d
 from sceneprior.core.scene import Scene
 from sceneprior.evaluation.report import ROOMS_SHOWN, write_report
-from sceneprior.evaluation.synthesis import FORMAT
+from sceneprior.evaluation.score_table import read_scores
 from sceneprior.paper.prior import TrainedPrior
 from sceneprior.paper.sampling import decode_latents, marked
 from sceneprior.render.scene_files import load_scene_folder
-from sceneprior.training.method import TrainedSampler
+from sceneprior.training.method import TrainedSampler, read_metrics
 
 UNFOLDING_STEPS = 7
 CURVES = (
@@ -36,7 +33,7 @@ def report_run(run: Path, scores: Path | None, out: Path, seed: int) -> None:
     """
     trained = load_any_run(run)
     config, shards = trained.config, Path(trained.config.data.shards)
-    found, in_3d = read_scores(scores, run, shards, f"--run {run}"), known_in_3d(shards, "train")
+    found, in_3d = _scores(scores, run, shards, f"--run {run}"), known_in_3d(shards, "train")
     commands, seconds = finished_commands(run.parent)
     keeping = trained if isinstance(trained, TrainedPrior) and trained.remembers_rooms else None
     method = made_by_run(config, trained.distribution)[0] or f"the method {config.method}"
@@ -70,12 +67,12 @@ def report_folder(folder: Path, shards: Path, scores: Path | None, out: Path) ->
         made_by=GIVEN,
         shards=shards,
         generated=scenes[:ROOMS_SHOWN],
-        scores=read_scores(scores, folder, shards, f"--scenes {folder} --shards {shards}"),
+        scores=_scores(scores, folder, shards, f"--scenes {folder} --shards {shards}"),
         commands=(),
     )
 
 
-def read_scores(path: Path | None, folder: Path, shards: Path, evaluated: str) -> dict[str, Any]:
+def _scores(path: Path | None, folder: Path, shards: Path, evaluated: str) -> dict[str, Any]:
     """Read the scores that `eval-fid` wrote to a file.
 
     Args:
@@ -87,11 +84,7 @@ def read_scores(path: Path | None, folder: Path, shards: Path, evaluated: str) -
         path = folder / "scores.json"
         if not path.exists() and not known_in_3d(shards, "test"):
             return {}
-    hint = f"write them with `sceneprior eval-fid {evaluated}`"
-    found = read_json(path, hint=hint)
-    if not isinstance(found, dict) or found.get("format") != FORMAT:
-        raise InputError(f"{path} holds no scores (another file); {hint}.")
-    return found
+    return read_scores(path, f"write them with `sceneprior eval-fid {evaluated}`")
 
 
 def unfold(trained: TrainedPrior) -> list[Scene]:
@@ -108,13 +101,9 @@ def read_curves(run: Path) -> dict[str, list[tuple[int, float]]]:
     """Loss curves of every stage from its metrics.csv, as `stage/term` -> (epochs, values)."""
     curves: dict[str, list[tuple[int, float]]] = {}
     for stage in run_config(run).stage_names:
-        path = run / stage / "metrics.csv"
-        if not path.is_file():
-            continue
-        with path.open(newline="") as file:
-            for row in csv.DictReader(file):
-                for term in CURVES:
-                    if row.get(f"train/{term}"):
-                        point = (int(row["epoch"]), float(row[f"train/{term}"]))
-                        curves.setdefault(f"{stage}/{term}", []).append(point)
+        for row in read_metrics(run / stage / "metrics.csv"):
+            for term in CURVES:
+                if row.get(f"train/{term}"):
+                    point = (int(row["epoch"]), float(row[f"train/{term}"]))
+                    curves.setdefault(f"{stage}/{term}", []).append(point)
     return curves

@@ -2,11 +2,14 @@
 
 import csv
 import io
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from statistics import mean
 from typing import Any, NamedTuple
+
+from pydantic import BaseModel, Field
 
 from sceneprior.apps.config import load_any_run
 from sceneprior.apps.experiments.commands import read_journal, read_result
@@ -22,11 +25,13 @@ from sceneprior.apps.experiments.comparison import (
 from sceneprior.core.files import write_whole
 from sceneprior.evaluation.metric import ARROWS, TableColumn
 from sceneprior.evaluation.metrics import DECODED, METRICS
+from sceneprior.evaluation.score_table import Scores
+from sceneprior.evaluation.view_scores import ViewScores
 from sceneprior.lifted.config import SAMPLER
 from sceneprior.paper.sampling import marked
 from sceneprior.training.method import read_checkpoint
 
-Scores = dict[str, Any]
+Result = dict[str, Any]
 """Values by key of a result, with its protocol, reference rows and the costs of training."""
 
 GAP = "–"
@@ -52,6 +57,18 @@ FACTORS = {"cpu_s": 1 / 60, "parameters": 1e-6}
 """Factors from the units of costs to those of the table."""
 
 
+class _RoomsProtocol(BaseModel):
+    latents: str = Field(pattern=f"^({'|'.join(map(re.escape, GROUPS))})(,|$)")
+    shards: str
+    n_generated: int
+    n_test: int
+    n_train_rooms: int
+
+
+class _Rooms(Scores):
+    protocol: _RoomsProtocol  # type: ignore[assignment]
+
+
 class Row(NamedTuple):
     """Result of one variant of a run."""
 
@@ -63,7 +80,7 @@ class Row(NamedTuple):
     """Name of the method in captions (`Variant.made_by`)."""
     variant: str
     """Value of the second column, which distinguishes the row from other rows of its run."""
-    scores: Scores
+    scores: Result
     group: str
     rank: int
     """Position of the row's group."""
@@ -78,7 +95,7 @@ class Form(NamedTuple):
     """Key of the values in a result, by title, for each reference row, which needs no training."""
     variant: str
     """Heading of the second column."""
-    say: Callable[[Scores], str]
+    say: Callable[[Result], str]
     """Builds the caption's sentence on the evaluation from one of the results."""
 
 
@@ -95,8 +112,12 @@ def write_tables(comparison: Comparison, runs: Sequence[Run], out: Path) -> None
 
 def rows_of(comparison: Comparison, run: Run) -> list[Row]:
     """The rows of an evaluated run; the first row includes the costs of training."""
-    found = {variant: read_result(variant.result) for variant in variants_of(comparison, run)}
-    of_task = _rows_of_views if isinstance(comparison, ViewComparison) else _rows_of_rooms
+    of_task, schema = (
+        (_rows_of_views, ViewScores)
+        if isinstance(comparison, ViewComparison)
+        else (_rows_of_rooms, _Rooms)
+    )
+    found = {of: read_result(of.result, schema) for of in variants_of(comparison, run)}
     title = comparison.rooms[run.rooms].title
     rows = [
         Row(title, run.seed, of.title, of.made_by, variant, scores, group, rank)
@@ -107,8 +128,8 @@ def rows_of(comparison: Comparison, run: Run) -> list[Row]:
 
 
 def _rows_of_rooms(
-    found: dict[Variant, Scores], learns_from: str
-) -> Iterator[tuple[Variant, str, Scores, str, int]]:
+    found: dict[Variant, Result], learns_from: str
+) -> Iterator[tuple[Variant, str, Result, str, int]]:
     """A row for each distribution of latents, and one for decoded training rooms if there are
     any."""
     # A result names the distribution of its rooms, with the mark of the version that wrote it.
@@ -126,11 +147,11 @@ def _rows_of_rooms(
 
 
 def _rows_of_views(
-    found: dict[Variant, Scores], learns_from: str
-) -> Iterator[tuple[Variant, str, Scores, str, int]]:
+    found: dict[Variant, Result], learns_from: str
+) -> Iterator[tuple[Variant, str, Result, str, int]]:
     """A row for each fit, and another one if its objects were also replaced by CAD models."""
     for variant, result in found.items():
-        of: dict[str, Scores] = {
+        of: dict[str, Result] = {
             name: {**row["summary"], "intervals": row["intervals"]}
             for name, row in result["rows"].items()
         }
@@ -195,7 +216,7 @@ def _lines(rows: Sequence[Row], form: Form) -> Iterator[list[str]]:
         if any(row.scores.get(key) is not None for row in rows)
     }
 
-    def line(title: str, second: str, found: Sequence[Scores]) -> list[str]:
+    def line(title: str, second: str, found: Sequence[Result]) -> list[str]:
         return [title, second, *(_cell(found, key, of) for key, of in columns.items())]
 
     yield ["method", form.variant, *(column.title for column in columns.values())]
@@ -210,7 +231,7 @@ def _lines(rows: Sequence[Row], form: Form) -> Iterator[list[str]]:
             yield line(runs[0].title, runs[0].variant, [row.scores for row in runs])
 
 
-def _cell(found: Sequence[Scores], key: str, column: TableColumn) -> str:
+def _cell(found: Sequence[Result], key: str, column: TableColumn) -> str:
     """The mean of a value over seeds, with half its range, or one value with its interval."""
     known = [scores[key] for scores in found if scores.get(key) is not None]
     values = [float(value) * FACTORS.get(key, 1.0) for value in known]
@@ -243,7 +264,7 @@ def _caption(rows: Sequence[Row], form: Form) -> str:
     return f"Rows {'; '.join(parts)}. {form.say(rows[0].scores)}; seeds {told}."
 
 
-def _say_rooms(scores: Scores) -> str:
+def _say_rooms(scores: Result) -> str:
     protocol = scores["protocol"]
     return (
         f"{protocol['n_generated']} generated rooms per run against {protocol['n_test']} test "
@@ -251,7 +272,7 @@ def _say_rooms(scores: Scores) -> str:
     )
 
 
-def _say_views(scores: Scores) -> str:
+def _say_views(scores: Result) -> str:
     protocol = scores["protocol"]
     surfaces, known = scores["with_surface"], protocol["known_model_share"]
     objects = f"{scores['objects']} objects"

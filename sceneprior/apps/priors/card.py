@@ -8,8 +8,7 @@ from typing import Any
 from sceneprior import __version__
 from sceneprior.apps.priors.packed import shared_settings
 from sceneprior.core.classes import VOID, label_set
-from sceneprior.core.files import read_json
-from sceneprior.core.shards import INDEX_NAME
+from sceneprior.core.shards import INDEX_NAME, read_index
 from sceneprior.evaluation.score_table import headings, score_rows
 from sceneprior.lifted.config import TrainedLifted
 from sceneprior.paper.prior import TrainedPrior
@@ -78,7 +77,7 @@ def _splits(shards: Path) -> list[str]:
     """Table of the shards' splits, if the shards are available."""
     if not (shards / INDEX_NAME).is_file():
         return []
-    index = read_json(shards / INDEX_NAME)
+    index = read_index(shards)
     rows = [
         f"| {split} | {counts['rooms']} | {counts['views']} | {counts['objects']} |"
         for split, counts in index.get("counts", {}).items()

@@ -28,7 +28,7 @@ from torch.overrides import TorchFunctionMode
 from sceneprior.core.boxes import QUARTERS
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import check_file, json_text, read_bytes, reading, write_whole
+from sceneprior.core.files import cause_of, check_file, json_text, read_bytes, reading, write_whole
 from sceneprior.core.parts import KINDS
 from sceneprior.core.settings import Section, check_settings
 from sceneprior.lifted.config import TrainedLifted
@@ -43,6 +43,8 @@ LARGEST = {CARD: 2**20, CONFIG: 2**24, WEIGHTS: 2**31}
 FEW = 4096
 """Number of elements below which tensors are kept in full precision, since little is saved."""
 HUB = "hf://"
+_LARGEST_WEIGHT = 1e6
+"""Bound of all weights; the largest in a shipped prior is 26,000."""
 
 
 class Description(Section):
@@ -136,10 +138,9 @@ def unpack(packed: PackedPrior, config: RunConfig, source: str) -> Trained:
         networks.load_state_dict(packed.tensors)
         return config.trained(networks, packed.said.stage, tuple(packed.said.room_ids))
     except (ValueError, RuntimeError, KeyError, TypeError, InputError) as error:
-        reason = " ".join(str(error).split())[:200]
         raise InputError(
-            f"{source}: its weights do not match its settings ({reason}); have it packed again "
-            "with `sceneprior pack`."
+            f"{source}: its weights do not match its settings ({cause_of(error)}); have it "
+            "packed again with `sceneprior pack`."
         ) from None
 
 
@@ -163,8 +164,8 @@ class _ShapesAlone(TorchFunctionMode):
 def _check(name: str, tensor: Tensor, classes: int) -> None:
     """Raise ValueError for numbers that are not finite, or class indices out of range."""
     if tensor.is_floating_point():
-        if not tensor.isfinite().all():
-            raise ValueError(f"{name} holds numbers that are not finite")
+        if not (tensor.abs() < _LARGEST_WEIGHT).all():
+            raise ValueError(f"{name} holds numbers that are not finite, or huge")
     elif name.endswith("_class") and not ((tensor >= -1) & (tensor < classes)).all():
         raise ValueError(f"{name} holds class indices out of range")
     elif name.endswith("part_kind") and not ((tensor >= -1) & (tensor < KINDS)).all():
@@ -285,9 +286,8 @@ def _fetch(where: str) -> Path:
     try:
         return Path(snapshot_download(where.removeprefix(HUB), allow_patterns=list(FILES)))
     except Exception as error:  # errors of the network, of the Hub, or an invalid name
-        reason = " ".join(str(error).split())[:160]
         raise InputError(
-            f"{where} cannot be fetched ({type(error).__name__}: {reason}). Check the name and the "
-            "network connection; for a private repository, set HF_TOKEN or run `hf auth "
-            "login`."
+            f"{where} cannot be fetched ({type(error).__name__}: {cause_of(error)}). Check the "
+            "name and the network connection; for a private repository, set HF_TOKEN or run `hf "
+            "auth login`."
         ) from None

@@ -11,9 +11,7 @@ model's file changes. The package's own furniture (`sceneprior/furniture`) is bu
 first needs its class, in 10 to 100 ms.
 """
 
-import contextlib
 import hashlib
-import io
 import os
 import warnings
 from collections.abc import Callable, Iterable, Mapping
@@ -25,6 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from sceneprior.core.checked import keep_arrays, kept_arrays
 from sceneprior.core.classes import LABEL_SETS, label_set
 from sceneprior.core.errors import InputError, InputWarning
 from sceneprior.core.files import (
@@ -32,8 +31,6 @@ from sceneprior.core.files import (
     is_name,
     list_files,
     list_folders,
-    read_arrays,
-    write_whole,
 )
 from sceneprior.core.furniture import (
     INFO_FILES,
@@ -300,10 +297,8 @@ def _points_of_models(
     """
     settings = f"{folder.resolve()}|{POINTS}|{SEED}|{FORMAT}"
     kept = cached / f"points-{hashlib.sha256(settings.encode()).hexdigest()[:16]}.npz"
-    before = dict[str, np.ndarray]()
-    with contextlib.suppress(InputError, KeyError, ValueError):  # absent or damaged: sampled again
-        file = read_arrays(kept)
-        before = dict(zip(file["keys"].tolist(), file["points"], strict=True))
+    file = kept_arrays(kept)
+    before = dict(zip(file["keys"].tolist(), file["points"], strict=True)) if file else {}
     keys, broken = dict[str, str](), dict[str, str]()
     for model_id in sorted(m for m, label in files.labels.items() if label != "void"):
         try:
@@ -321,9 +316,8 @@ def _points_of_models(
                 broken[model_id] = str(error)
     finally:
         if points.keys() - before.keys():
-            buffer = io.BytesIO()
-            np.savez(buffer, keys=np.array(list(points)), points=np.stack(list(points.values())))
-            write_whole(kept, buffer.getvalue())
+            stacked = np.stack(list(points.values()))
+            keep_arrays(kept, {"keys": np.array(list(points)), "points": stacked})
     return {m: points[key] for m, key in keys.items() if key in points}, broken
 
 

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int, Shaped, UInt8
 from torch import Tensor, nn
 
-from sceneprior.core.errors import InputError
+from sceneprior.core.errors import InputError, cause_of
 from sceneprior.evaluation.features import SIZE_PX
 from sceneprior.evaluation.metric import (
     PICTURED,
@@ -184,9 +184,8 @@ def alexnet_weights(path: Path) -> dict[str, Tensor]:
             if tensor.shape != expected[name].shape:
                 raise ValueError(f"features.{name} has shape {tuple(tensor.shape)}")
     except Exception as error:  # a damaged file raises almost anything in torch.load
-        reason = str(error).strip().splitlines()[0][:200] if str(error) else type(error).__name__
         raise InputError(
-            f"{path} is not the state dict of torchvision's AlexNet ({reason}); give "
+            f"{path} is not the state dict of torchvision's AlexNet ({cause_of(error)}); give "
             "`alexnet-owt-7be5be79.pth`, or leave the option out."
         ) from None
     return weights

@@ -6,7 +6,6 @@ found again when its inputs or its version changes, and is left out if the folde
 
 import contextlib
 import hashlib
-import io
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,10 +20,10 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from sceneprior.core.boxes import turn_boxes
+from sceneprior.core.checked import keep_arrays, kept_arrays
 from sceneprior.core.classes import VOID
 from sceneprior.core.dataset import BLANK, RoomDataset, allowed_views
-from sceneprior.core.errors import InputError, ShardError
-from sceneprior.core.files import read_arrays, write_whole
+from sceneprior.core.errors import ShardError
 from sceneprior.core.observations import RoomViews
 from sceneprior.core.parts import Parts, filled_cells
 from sceneprior.core.shards import Shard, iterate_rooms
@@ -268,16 +267,13 @@ def _cached(
 ) -> dict[str, np.ndarray]:
     """Read the arrays cached in a file under this key. If they are missing, compute them, and cache
     them if the file is writable."""
-    with contextlib.suppress(InputError):  # missing or damaged: computed again
-        saved = read_arrays(path)
-        if str(saved.get("key")) == key:
-            return saved
+    saved = kept_arrays(path)
+    if str(saved.get("key")) == key:
+        return saved
     found = find()
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, key=np.array(key), **found)
     if path.parent.is_dir():  # no folder is created
         with contextlib.suppress(OSError):  # a read-only folder gets no cache
-            write_whole(path, buffer.getvalue())
+            keep_arrays(path, {"key": np.array(key), **found})
     return found
 
 

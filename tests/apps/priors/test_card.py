@@ -25,7 +25,7 @@ def trained(sampler_run):
 
 def test_data_scores_and_limits_stand_in_it(trained, tmp_path):
     counts = {"train": {"rooms": 12, "views": 96, "objects": 40}}
-    (tmp_path / "index.json").write_text(json.dumps({"counts": counts}))
+    (tmp_path / "index.json").write_text(json.dumps({"label_set": "", "counts": counts}))
     data = trained.config.data.model_copy(update={"shards": str(tmp_path)})
     trained = replace(trained, config=trained.config.model_copy(update={"data": data}))
     card = model_card(trained, "tiny", "Made by **toys**, CC0.", SCORES, half=True)
