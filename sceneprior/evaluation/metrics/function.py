@@ -158,7 +158,7 @@ class Habits:
                 if len(found) >= FEWEST
             },
         )
-        outcomes = defaultdict(list)
+        outcomes: dict[str, list[bool]] = defaultdict(list)
         for scene in rooms:
             for key, found in checks(scene, habits).items():
                 outcomes[key] += found

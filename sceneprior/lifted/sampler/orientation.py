@@ -24,7 +24,7 @@ from sceneprior.lifted.sampler.frames import GRAZE_M, OUTWARD, own_sides, shared
 
 FURTHEST_M = 1.0
 """Length to which gaps are clipped."""
-WEIGHTS = {
+WEIGHTS: dict[str, tuple[float, ...]] = {
     "storage": (-1.77, 0.24, -1.59, 0.04, -0.36, 0.05, 2.35),
     "chair": (-1.50, 0.91, -0.53, 1.71, 0.30, 2.74, -0.81),
     "sofa": (-1.43, 0.44, -0.96, 0.09, -1.29, 1.20, 3.11),

@@ -98,11 +98,11 @@ class SamplerRooms:
             for row, walls in zip(kept, lifted.walls, strict=True)
         ]
         self.to_walls_m = pad_sequence(to_walls, batch_first=True)
-        self.backs, self.confidence, looks = orient(
+        self.backs, self.confidence, posed = orient(
             self.rooms, self.to_walls_m, padded(errors), prototypes,
             label_set(self.label_set), backs,
         )  # fmt: skip
-        self.rooms = replace(self.rooms, looks=looks)
+        self.rooms = replace(self.rooms, looks=posed)
         return self
 
     def __len__(self) -> int:
