@@ -177,7 +177,9 @@ def main_classes(
     notes = [f"ids with several classes take the most frequent one: {_some(changing)}"]
     own = {tidy(name) for name in label_set(label_set_name)}
     most = {
-        number: max(count, key=lambda name, count=count: (count[name], tidy(name) in own))
+        number: max((n, tidy(name) in own, -k, name) for k, (name, n) in enumerate(count.items()))[
+            -1
+        ]
         for number, count in sorted(votes.items())
     }
     return most, notes if changing else []
