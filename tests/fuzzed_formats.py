@@ -138,11 +138,11 @@ PLY = (
 
 @entry("model PLY")
 def model_ply(folder: Path) -> Entry:
-    from sceneprior.core.ground_truth import read_model
+    from sceneprior.core.ground_truth import load_model
 
     path = folder / "a.ply"
     path.write_text(PLY)
-    return path, lambda: read_model(path)
+    return path, lambda: load_model(path)
 
 
 def model_folder(file: str, folder: Path) -> Entry:
