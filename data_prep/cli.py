@@ -156,6 +156,10 @@ def prep_posed(
             help="Classes: a file with one per line, a list (void,bed,chair), or a set's name."
         ),
     ],
+    class_map: Annotated[
+        Path | None,
+        typer.Option(help="CSV of names of the masks and their classes: rows `bed chair,chair`."),
+    ] = None,
     tools: Annotated[
         list[str] | None,
         typer.Option(
@@ -202,11 +206,13 @@ def prep_posed(
 
     Exit status: 0, or 3 if rooms failed (the others are prepared; report.csv says why).
     """
-    from data_prep.readers.posed.formats import read_formats, read_label_set
+    from data_prep.readers.posed.formats import read_class_map, read_formats, read_label_set
     from data_prep.readers.posed.reader import Posed
 
+    classes = read_label_set(label_set)
     source = Posed(
-        rooms, classes=read_label_set(label_set), **read_formats(tools or ()), up=up,
+        rooms, classes=classes, class_map=read_class_map(class_map, classes),
+        **read_formats(tools or ()), up=up,
         floor_m=floor_m, camera_height_m=camera_height_m, metres_per_unit=metres_per_unit,
         max_side=max_side, tracks=tracks, max_views=max_views, test_share=test_share, seed=seed,
         only=only, model=model,

@@ -40,13 +40,13 @@ MAY_TOO = {
 }
 
 BUDGET = {
-    "data_prep": (12616, 59),
+    "data_prep": (12644, 59),
     "sceneprior/core": (5729, 28),
     "sceneprior/furniture": (588, 4),
     "sceneprior/render": (4490, 23),
-    "sceneprior/training": (931, 5),
+    "sceneprior/training": (926, 5),
     "sceneprior/paper": (2406, 12),
-    "sceneprior/lifted": (8174, 41),
+    "sceneprior/lifted": (8170, 41),
     "sceneprior/baselines": (2909, 14),
     "sceneprior/evaluation": (4558, 21),
     "sceneprior/interchange": (892, 5),

@@ -13,10 +13,11 @@ from data_prep.readers.posed.segmenters import (
     ObjectFolders,
 )
 from data_prep.readers.posed.transforms import POSES
-from sceneprior.core.checked import shown
-from sceneprior.core.classes import LABEL_SETS, label_set_name
+from sceneprior.core.checked import plain, shown
+from sceneprior.core.classes import LABEL_SETS, label_set, label_set_name
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import read_json, read_text
+from sceneprior.core.files import read_json, read_table, read_text
+from sceneprior.core.id_tables import tidy
 
 _MASKS: tuple[type[MaskFormat], ...] = (
     IdPngs, PanopticPngs, ObjectFolders, GroundedSam2, GroundedSam2Images, CocoMasks,
@@ -68,6 +69,23 @@ def read_formats(names: Iterable[str]) -> dict[str, Any]:
                 "them, and one of the other kind."
             )
     return given
+
+
+def read_class_map(path: Path | None, label_set_name: str) -> tuple[tuple[str, str], ...]:
+    """Read `--class-map`, a CSV with rows `name of the masks,class`: names as `tidy`, and classes
+    of the label set, void included."""
+    rows = [] if path is None else read_table(path)
+    known = {tidy(name): name for name in label_set(label_set_name)}
+    found = {}
+    for number, row in enumerate(rows, start=1):
+        if any(cell.strip() for cell in row):
+            if len(row) != 2 or tidy(row[1]) not in known:
+                raise InputError(
+                    f"{path}, row {number} is {shown(','.join(row))}; expected a name of the masks "
+                    f"and its class, one of {plain(', '.join(known.values()), 400)}."
+                )
+            found[tidy(row[0])] = known[tidy(row[1])]
+    return tuple(found.items())
 
 
 def read_label_set(text: str) -> str:

@@ -87,6 +87,8 @@ class MaskFormat(ABC):
 
     def __init__(self, folder: Path, label_set_name: str):
         self.folder, self.label_set_name = folder, label_set_name
+        self.class_map: Mapping[str, str] = {}
+        """Classes of names of the masks, by the names as `tidy`."""
         self.notes: list[str] = []
 
     @property
@@ -107,6 +109,11 @@ class MaskFormat(ABC):
     def of(self, frame: PosedFrame) -> FrameMask | None:
         """The masks of a frame, even if they show no object; None if it has none."""
         return self.frames.get(frame.stem)
+
+    def table(self, of_id: dict[int, str]) -> IdTable:
+        """The table of ids whose names are given, mapped to classes."""
+        named = {key: self.class_map.get(tidy(name), name) for key, name in of_id.items()}
+        return IdTable(named, self.label_set_name, str(self.folder))
 
     def wanted(self, frame: PosedFrame) -> str:
         """Description, for messages, of the expected file of a frame's masks, and of what exists
@@ -209,7 +216,7 @@ def read_tracked(
 
     An `InputError` if most ids occur in one frame only, as if each frame had its own ids.
     """
-    table = IdTable(masks.classes(), masks.label_set_name, str(masks.folder))
+    table = masks.table(masks.classes())
     of_lenses: list[str] = []
     images, stuff, intrinsics = [], [], []
     frames_of = np.zeros(len(table.classes) + 1, dtype=np.int64)
@@ -272,7 +279,7 @@ def read_untracked(
             f"{masks.folder} has {count - 1} masks, expected at most {LARGEST_ID - 1}; use fewer "
             "frames (--max-views)."
         )
-    table = IdTable(class_names, masks.label_set_name, str(masks.folder))
+    table = masks.table(class_names)
     ids = table.ids(numbers).astype(np.int32)
     # The table's last id stands for masks without a class, whose content is unknown.
     ids[ids == len(table.classes)] = UNKNOWN

@@ -69,6 +69,8 @@ class Posed(Reader):
     """Scale in rooms whose file has none. Poses from pictures alone (COLMAP) have no unit."""
     model: int | None = None
     """Number of one of COLMAP's models; None takes the largest."""
+    class_map: tuple[tuple[str, str], ...] = ()
+    """Pairs of a name of the masks, as `tidy`, and its class."""
     tracks: str = "given"
     """One of `TRACKS`: ids are `given` for all frames, or `auto` finds objects from masks whose ids
     have no meaning across frames."""
@@ -100,7 +102,8 @@ class Posed(Reader):
         formats: dict[str, Any] = {"poses": self.poses, "masks": self.masks}
         if self.model is not None:
             formats["model"] = self.model
-        return {"from": formats, **{name: getattr(self, name) for name in names}}
+        mapped = {"class_map": dict(self.class_map)} if self.class_map else {}
+        return {"from": formats, **{name: getattr(self, name) for name in names}, **mapped}
 
     def fingerprint(self, scenes: list[str]) -> dict[str, Any]:
         """See `Reader.fingerprint`: names and sizes of files are part of it, so that shards of
@@ -175,7 +178,9 @@ class Posed(Reader):
     def open(self, room: Path) -> tuple[Recording, MaskFormat]:
         """Poses and masks of a room's folder."""
         recording = read_recording(room, self.poses, self.model)
-        return recording, mask_format(room, self.masks)(room, self.label_set)
+        masks = mask_format(room, self.masks)(room, self.label_set)
+        masks.class_map = dict(self.class_map)
+        return recording, masks
 
     def found(self) -> list[str]:
         """Sentences that name the tools whose files were found, for formats that were guessed."""

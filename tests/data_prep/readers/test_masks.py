@@ -11,11 +11,11 @@ from PIL import Image
 from posed_files import SET, PosedRoom, furniture, prepared
 from refusals import refused
 
-from data_prep.readers.posed.formats import MASKS, read_formats, read_label_set
+from data_prep.readers.posed.formats import MASKS, read_class_map, read_formats, read_label_set
 from data_prep.readers.posed.masks import find_table
 from data_prep.readers.posed.reader import Posed
 from data_prep.readers.posed.transforms import POSES, read_recording
-from sceneprior.core.errors import InputWarning
+from sceneprior.core.errors import InputError, InputWarning
 from sceneprior.core.id_tables import read_class_table
 from sceneprior.training.fit import warn_of_losses
 
@@ -139,6 +139,26 @@ def test_a_segment_of_stuff_with_several_classes_is_background(room):
 
     tools.write_panoptic(room, rename)
     assert prepared(room).views.stuff is None
+
+
+def test_names_are_mapped_to_classes(room, tmp_path):
+    """Names of the masks get the classes of --class-map; other names stay as they are."""
+    table = tmp_path / "map.csv"
+    table.write_text("\ufeffBack_Pack ,void\nbackpack,chair\n")
+    pairs = read_class_map(table, SET)
+    assert dict(pairs) == {"back pack": "void", "backpack": "chair"}
+    plain = prepared(room)
+    source = Posed(room.folder.parent, classes=SET, class_map=pairs)
+    mapped = prepared(room, class_map=pairs)
+    assert "class_map" in source.options() and len(mapped.views.object_class) == 1 + len(
+        plain.views.object_class
+    )
+    assert any("backpack" in note for note in plain.notes)
+    assert not any("backpack" in note for note in mapped.notes)
+    for row in ("backpack,spaceship", "backpack", "bed,chair,desk"):
+        table.write_text(row)
+        with pytest.raises(InputError, match=r"map.csv, row 1 .*expected a name of the masks"):
+            read_class_map(table, SET)
 
 
 def test_crowds_and_ids_without_a_segment_are_void(room):
