@@ -211,7 +211,7 @@ def without_class(lines: Iterable[Line]) -> list[str]:
     named = ", ".join(shown(name) for name, _ in counts[:_NAMED])
     more = ", ..." if len(counts) > _NAMED else ""
     total = sum(count for _, count in counts)
-    return [f"{total} objects or masks whose name is no class ({named}{more})"] * bool(counts)
+    return [f"{total} objects whose name is no class ({named}{more})"] * bool(counts)
 
 
 def make_table(

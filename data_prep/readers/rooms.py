@@ -63,7 +63,7 @@ class FramedRoom:
     world_from_file: np.ndarray = field(default_factory=lambda: np.eye(4))
     """Rigid transform, (4, 4), from the world of the files, in metres, to this one."""
     outside: Mapping[str, int] = field(default_factory=dict)
-    """Number of objects, or of masks without tracks, by name outside the user's label set."""
+    """Number of objects (estimated without tracks) by name outside the user's label set."""
     poses_file: str = ""
     """Name of the file of poses, for `inspect --verify`."""
 

@@ -221,10 +221,12 @@ def warn_of_losses(shards: Path, rooms: int) -> None:
         if rooms < there:
             said = f"{rooms} of the {there} rooms prepared for 'train' are left in {shards}"
             warnings.warn(f"Only {said}; prepare them again.", InputWarning, stacklevel=1)
-        known, unknown = (sum(report[k].values()) for k in ("classes", "unknown_categories"))
+        lines = [line for line in report["rooms"] if line["status"] == "prepared"]
+        keys = "classes", "unknown_categories"
+        known, unknown = (sum(sum(line[key].values()) for line in lines) for key in keys)
         if 2 * unknown >= known > 0:
             named = ", ".join(map(shown, [*report["unknown_categories"]][:5]))
-            said = f"{unknown} objects or masks of {shards} have no class, and {known} objects have"
+            said = f"{unknown} objects of {shards} have no class, and {known} objects have"
             why = f"their names ({named}) are not in the label set, so they are not learned"
             warnings.warn(f"{said} one: {why}.", InputWarning, stacklevel=1)
 

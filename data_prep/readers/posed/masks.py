@@ -1,5 +1,6 @@
 """The masks of a room, in any tool's format: the interface of formats, and how they are read."""
 
+import math
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -290,11 +291,14 @@ def read_untracked(
     frame_masks = FrameMasks(ids, table.classes[:-1].astype(np.int64))
     tracks = associate(frame_masks, world_to_camera, intrinsics, given)
     count = len(tracks.object_class)
+    # Objects, as classes are counted: an object has this many masks on average.
+    masks_each = max(len(given) / max(count, 1), 1.0)
+    outside = {name: math.ceil(k / masks_each) for name, k in table.outside.items()}
     notes.append(f"{count} objects are found from {len(given)} masks (--tracks auto)")
     return {
         "ids": np.where(tracks.ids < 0, count + 1, tracks.ids).astype(np.uint32),
         "object_class": np.array([*tracks.object_class, VOID]),
-        "outside": table.outside,
+        "outside": outside,
         "stuff": thinned_stuff(table.stuff(numbers)),
         "intrinsics": intrinsics,
         "notes": tuple(notes),

@@ -1,6 +1,7 @@
 """Masks and poses of every tool: what is read beside the room, guessed, joined and left out."""
 
 import json
+import warnings
 
 import capture_files as tools
 import numpy as np
@@ -188,14 +189,35 @@ def test_names_that_are_no_class_are_counted_to_the_end(room, cli, tmp_path):
     done = cli("prep-posed", room.folder, "--out", out, "--label-set", f"{SET},piano",
                "--workers", 1)  # fmt: skip
     for text in (done.output, cli("inspect", out, "--verify").output):
-        assert "objects or masks whose name is no class" in " ".join(text.split())
+        assert "objects whose name is no class" in " ".join(text.split())
         assert "all is well" not in text
     assert "no object is" in done.output and "piano" in done.output
     with pytest.warns(InputWarning) as told:
         warn_of_losses(out, 0)
     assert "0 of the 1 rooms" in str(told[0].message)
-    if sum(made.unknown_categories.values()) * 2 >= len(made.views.object_class):
-        assert table[key] in str(told[1].message)
+
+
+@pytest.mark.parametrize(
+    ("unknown", "known", "status", "warns"),
+    [(2, 4, "prepared", True), (1, 4, "prepared", False), (9, 4, "filtered", False)],
+)
+def test_fit_warns_if_a_third_of_the_objects_has_no_class(tmp_path, unknown, known, status, warns):
+    """Names in rooms that are not prepared do not count: their objects with a class do not."""
+    rooms = [
+        {"status": "prepared", "classes": {"bed": known}, "unknown_categories": {}},
+        {"status": status, "classes": {}, "unknown_categories": {"bed.": unknown}},
+    ]
+    report = {
+        "counts": {"train": {"rooms": 1}},
+        "rooms": rooms,
+        "classes": {"bed": known},
+        "unknown_categories": {"bed.": unknown},
+    }
+    (tmp_path / "report.json").write_text(json.dumps(report))
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        warn_of_losses(tmp_path, 1)
+    assert [str(one.message).startswith(f"{unknown} objects") for one in told] == [True] * warns
 
 
 def test_optimized_keyframes_of_polycam_are_preferred(room):
