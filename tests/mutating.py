@@ -217,7 +217,7 @@ def damaged_prior(packed: bytes, rng: np.random.Generator) -> bytes:
         files[name] = damaged_json(json.loads(files[name]), rng).encode()
     elif name.endswith(".safetensors") and rng.random() < 0.8:
         tensors = load(files[name])
-        changed = tensors[str(rng.choice(list(tensors)))]
+        changed = tensors[str(rng.choice(sorted(tensors)))]
         odd = [np.nan, -1e30, 1e30, 1e5, 0] if changed.dtype.kind == "f" else [-1, 99, 30_000]
         with np.errstate(all="ignore"):
             changed[...] = np.array(rng.choice(odd)).astype(changed.dtype)

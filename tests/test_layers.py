@@ -41,7 +41,7 @@ MAY_TOO = {
 
 BUDGET = {
     "data_prep": (12648, 59),
-    "sceneprior/core": (5729, 28),
+    "sceneprior/core": (5733, 28),
     "sceneprior/furniture": (588, 4),
     "sceneprior/render": (4490, 23),
     "sceneprior/training": (928, 5),
@@ -50,7 +50,7 @@ BUDGET = {
     "sceneprior/baselines": (2909, 14),
     "sceneprior/evaluation": (4558, 21),
     "sceneprior/interchange": (892, 5),
-    "sceneprior/apps": (6270, 34),
+    "sceneprior/apps": (6272, 34),
 }
 """Most lines and modules of a folder. They go down freely, and up only in a commit that says what
 it bought and what went for it."""

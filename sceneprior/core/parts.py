@@ -15,10 +15,12 @@ import shapely
 from jaxtyping import Bool, Float, Int
 
 from sceneprior.core.boxes import CUBE_CORNERS
+from sceneprior.core.errors import InputError
 
 if TYPE_CHECKING:
     from manifold3d import Manifold
 
+_FARTHEST_M = 1e6
 KINDS = 5
 BOX, CYLINDER, ELLIPSOID, DOME, BOWL = range(KINDS)
 """Kinds of parts. A part is inscribed in its box. Cylinders are upright; a dome is the upper half
@@ -183,6 +185,8 @@ def prism(outline: Float[np.ndarray, "corners 2"], low: float, high: float) -> "
     """The upright solid over an outline (x, z) of either orientation, between two heights."""
     from manifold3d import CrossSection, FillRule
 
+    if not (np.abs([*np.ravel(outline), low, high]) < _FARTHEST_M).all():
+        raise InputError("A part of an object is endlessly large: its prior or file is damaged.")
     flat = CrossSection([np.asarray(outline, np.float64)], FillRule.NonZero)
     # Extruded along its third axis, which becomes y.
     to_room = np.array([[1, 0, 0, 0], [0, 0, 1, low], [0, 1, 0, 0]])

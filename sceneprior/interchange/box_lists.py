@@ -104,7 +104,7 @@ def _one_by_one(path: Path, record: dict[str, Any]) -> list[dict[str, Any]]:
     if centers.size == 0:
         centers, sizes, angles = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
         labels = np.zeros(0, dtype=int)
-    if angles.ndim == centers.ndim and angles.shape[-1] == 1:
+    if angles.ndim == centers.ndim and angles.shape[-1:] == (1,):
         angles = angles[..., 0]
     objects = centers.shape[:-1]
     if (
@@ -137,7 +137,7 @@ def _objects(
 ) -> Iterator[SceneObject]:
     known = label_set(label_set_name)
     labels = room["class_labels"]
-    if labels.dtype.kind not in "US":
+    if labels.dtype.kind not in "US" or labels.ndim != 1:
         labels = _label_names(path, labels, columns or known[1:], columns is None)
     for label, center, size, angle in zip(labels, *(room[key] for key in NEEDED[1:]), strict=True):
         if label == "end":

@@ -166,6 +166,8 @@ def _check(name: str, tensor: Tensor, classes: int) -> None:
     if tensor.is_floating_point():
         if not (tensor.abs() < _LARGEST_WEIGHT).all():
             raise ValueError(f"{name} holds numbers that are not finite, or huge")
+    elif name == "sampler.look_class" and not (tensor >= 0).any():
+        raise ValueError(f"{name} holds no class")
     elif name.endswith("_class") and not ((tensor >= -1) & (tensor < classes)).all():
         raise ValueError(f"{name} holds class indices out of range")
     elif name.endswith("part_kind") and not ((tensor >= -1) & (tensor < KINDS)).all():
