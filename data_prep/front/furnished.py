@@ -13,6 +13,7 @@ from sceneprior.core.files import file_stamp, is_name
 from sceneprior.core.furniture import MODEL_FILE, model_categories, read_obj
 from sceneprior.core.scene import Mesh
 
+_FLAT_M = 1e-3
 _NO_FURNITURE_M = 10.0
 """Longest plausible side of a model; nearly all models in centimetres exceed it."""
 _OVERSIZED = (50.0, 200.0)
@@ -110,10 +111,32 @@ class ModelBank:
 
     @cachedmethod(lambda self: self._meshes)
     def _read(self, path: Path, stamp: tuple[int, int]) -> Mesh:
-        mesh = read_obj(path)
+        mesh = _without_shadow(read_obj(path))
         if float(np.ptp(mesh.vertices_m, axis=0).max()) > _NO_FURNITURE_M:
             return Mesh(mesh.vertices_m / np.float32(100), mesh.faces)
         return mesh
+
+
+def _without_shadow(mesh: Mesh) -> Mesh:
+    """A mesh without flat parts too large for furniture, if its other parts are not: some models
+    lie on a plane of 60 m that shows their shadow. The parts of a model in centimetres are all too
+    large, and stay."""
+    if float(np.ptp(mesh.vertices_m, axis=0).max(initial=0)) <= _NO_FURNITURE_M:
+        return mesh
+    from trimesh.graph import connected_component_labels
+
+    faces = np.asarray(mesh.faces)
+    edges = np.concatenate([faces[:, :2], faces[:, 1:]])
+    part = connected_component_labels(edges, len(mesh.vertices_m))
+    sizes = np.array(
+        [np.ptp(mesh.vertices_m[part == k], axis=0) for k in range(int(part.max()) + 1)]
+    )
+    large = sizes.max(axis=1) > _NO_FURNITURE_M
+    shadow = large & (sizes.min(axis=1) < _FLAT_M)
+    if shadow.all() or (large & ~shadow).any():
+        return mesh
+    used, kept = np.unique(faces[~shadow[part[faces[:, 0]]]], return_inverse=True)
+    return Mesh(mesh.vertices_m[used], kept.reshape(-1, 3).astype(faces.dtype))
 
 
 def unit_of(mesh: Mesh, entry: dict[str, Any]) -> float:

@@ -8,13 +8,14 @@ It is used to prepare rooms and to retrieve CAD models for generated rooms.
 
 import csv
 import functools
+import re
 from pathlib import Path
 
 import numpy as np
 
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import check_file, read_json
+from sceneprior.core.files import read_bytes, read_json
 from sceneprior.core.scene import Mesh
 
 MODEL_FILE = "raw_model.obj"
@@ -97,30 +98,56 @@ def class_of_category(category: str, label_set_name: str) -> str:
     return "void"
 
 
+def obj_text(path: Path) -> str:
+    """Read an OBJ as readers expect it, who know neither tabs, indents and continued lines nor
+    indices that count back from the line in which they stand."""
+    text = read_bytes(path).decode("utf-8", errors="replace")
+    text = re.sub(r"\\\r?\n", " ", text).replace("\t", " ")
+    if not _UNUSUAL.search(text):
+        return text
+    number = dict.fromkeys(("v", "vt", "vn"), 0)
+    lines = []
+    for line in map(str.strip, text.splitlines()):
+        head, _, rest = line.partition(" ")
+        if head in number:
+            number[head] += 1
+        elif head in ("f", "l", "p") and "-" in rest:
+            corners = [
+                "/".join(
+                    str(int(index) + 1 + count) if index.startswith("-") else index
+                    for index, count in zip(corner.split("/"), number.values(), strict=False)
+                )
+                for corner in rest.split()
+            ]
+            line = " ".join([head, *corners])
+        lines.append(line)
+    return "\n".join(lines)
+
+
+_UNUSUAL = re.compile(r"^ +\S|^[flp] .*-\d", re.MULTILINE)
+
+
 def read_obj(path: Path) -> Mesh:
     """Read the triangles of a Wavefront OBJ, without materials, normals and unused vertices."""
     vertices: list[list[str]] = []
     polygons: list[list[str]] = []
-    check_file(path)
+    text = obj_text(path)
     try:
-        with path.open(encoding="utf-8", errors="replace") as file:
-            for line in file:
-                if line.startswith("v "):
-                    vertices.append(line.split()[1:4])
-                elif line.startswith("f "):
-                    polygons.append([corner.split("/", 1)[0] for corner in line.split()[1:]])
+        for line in text.splitlines():
+            if line.startswith("v "):
+                vertices.append(line.split()[1:4])
+            elif line.startswith("f "):
+                polygons.append([corner.split("/", 1)[0] for corner in line.split()[1:]])
         points = np.array(vertices, dtype=np.float32).reshape(-1, 3)
         corners = [
             (polygon[0], polygon[i - 1], polygon[i])
             for polygon in polygons
             for i in range(2, len(polygon))
         ]
-        faces = np.array(corners, dtype=np.int64).reshape(-1, 3)
-        # OBJ indices start at 1; negative ones count from the end (correct for a single group).
-        faces = np.where(faces < 0, faces + len(points), faces - 1)
+        faces = np.array(corners, dtype=np.int64).reshape(-1, 3) - 1  # OBJ indices start at 1
         used, faces = np.unique(faces, return_inverse=True)
         points = points[used]
-    except (OSError, ValueError, IndexError, OverflowError) as error:
+    except (ValueError, IndexError, OverflowError) as error:
         raise InputError(f"{path.parent.name}/{path.name} cannot be read ({error})") from None
     if not len(used) or used[0] < 0 or not np.isfinite(points).all():
         raise InputError(f"{path.parent.name}/{path.name} holds no usable triangles")

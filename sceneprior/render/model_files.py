@@ -1,12 +1,18 @@
 """GLBs and OBJs with their materials, as parts that have one material each."""
 
+import io
+import json
+import struct
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sceneprior.core.files import check_file
+from sceneprior.core.checked import shown
+from sceneprior.core.errors import InputError
+from sceneprior.core.files import read_bytes
+from sceneprior.core.furniture import obj_text
 from sceneprior.core.scene import Mesh, Textured, join_meshes, mesh_of_file
 from sceneprior.render.appearance import linear_rgba
 
@@ -24,18 +30,24 @@ def load_parts(
 ) -> dict[str, Textured]:
     """The meshes of a GLB or an OBJ by node name, with the transforms of their nodes applied.
 
-    A damaged file may raise any exception.
+    A damaged file may raise any exception. A GLB that needs an extension that is not read here,
+    such as Draco's compression, raises an `InputError`.
 
     Args:
         file_type: Format of the file; None uses its suffix.
     """
     import trimesh
 
-    check_file(path)
+    content, kind = read_bytes(path), file_type or Path(path).suffix.lower().removeprefix(".")
+    if kind == "obj":
+        content = obj_text(path).encode()
+    elif content.startswith(b"glTF"):
+        content = _plain_glb(content)
     # process=False keeps vertices and faces as written.
     loaded = trimesh.load_scene(
-        Path(path), file_type=file_type, process=False, skip_materials=not with_materials
-    )
+        io.BytesIO(content), file_type=kind, process=False, skip_materials=not with_materials,
+        resolver=trimesh.resolvers.FilePathResolver(str(path)),
+    )  # fmt: skip
     parts = {}
     for node in loaded.graph.nodes_geometry:
         transform, name = loaded.graph[node]
@@ -44,6 +56,66 @@ def load_parts(
         placed = mesh_of_file(vertices @ transform[:3, :3].T + transform[:3, 3], mesh.faces)
         parts[node] = Textured(placed, *(_surface(mesh.visual) if with_materials else ()))
     return parts
+
+
+_READ = ("KHR_lights_punctual", "KHR_materials_", "KHR_mesh_quantization")
+"""Beginnings of the names of extensions that a GLB may require."""
+_PREFIX = struct.Struct("<4sIIII")
+_WHOLE = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2"}
+_WIDTH = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+
+
+def _plain_glb(content: bytes) -> bytes:
+    """A GLB whose normalized whole numbers are floats, since trimesh takes them as they are."""
+    _, version, _, length, _ = _PREFIX.unpack_from(content)
+    start = _PREFIX.size
+    data = json.loads(content[start : start + length])
+    needed = data.get("extensionsRequired", [])
+    if unknown := [name for name in needed if not str(name).startswith(_READ)]:
+        raise InputError(
+            f"it needs {shown(unknown[0])}, which is not read here; export it again as a plain "
+            "GLB, without compressed meshes or textures."
+        )
+    chosen = {
+        attributes[name]
+        for mesh in data.get("meshes", [])
+        for primitive in mesh["primitives"]
+        for attributes in [primitive["attributes"]]
+        for name in attributes
+        if name == "POSITION" or name.startswith("TEXCOORD")
+    }
+    accessors = data.get("accessors", [])
+    turned = [k for k in sorted(chosen) if accessors[k].get("normalized")]
+    if version != 2 or not turned:
+        return content
+    packed = bytearray(content[start + length + 8 :])
+    for accessor in (accessors[k] for k in turned):
+        view, kind = data["bufferViews"][accessor["bufferView"]], _WHOLE[accessor["componentType"]]
+        width, size = _WIDTH[accessor["type"]], np.dtype(kind).itemsize
+        at = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+        stride, count = view.get("byteStride", width * size), accessor["count"]
+        if at + (count - 1) * stride + width * size > len(packed):
+            raise ValueError("an accessor reaches beyond its buffer")
+        raw = np.ndarray((count, width), kind, bytes(packed), at, (stride, size))
+        values = np.maximum(raw / np.iinfo(kind).max, -1.0).astype("<f4")
+        packed += bytes(-len(packed) % 4)
+        data["bufferViews"].append(
+            {"buffer": 0, "byteOffset": len(packed), "byteLength": values.nbytes}
+        )
+        packed += values.tobytes()
+        accessor.update(bufferView=len(data["bufferViews"]) - 1, byteOffset=0, componentType=5126)
+        del accessor["normalized"]
+    data["buffers"][0]["byteLength"] = len(packed)
+    packed += bytes(-len(packed) % 4)
+    text = json.dumps(data).encode()
+    text += b" " * (-len(text) % 4)
+    whole = start + len(text) + 8 + len(packed)
+    return (
+        _PREFIX.pack(b"glTF", 2, whole, len(text), 0x4E4F534A)
+        + text
+        + struct.pack("<I4s", len(packed), b"BIN\0")
+        + packed
+    )
 
 
 def joined(parts: Iterable[Textured]) -> Mesh:

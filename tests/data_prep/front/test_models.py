@@ -69,3 +69,19 @@ def test_wrong_folders_of_models(front, tmp_path):
 def test_the_revised_list_of_models(front):
     (front.future / "model_info.json").rename(front.future / "model_info_revised.json")
     assert ModelBank(front.future).category("bed") == "king-size bed"
+
+
+def test_a_plane_of_shadow_is_no_part_of_a_model(front):
+    """Nor does it make the model one in centimetres; a model all of whose parts are large is."""
+    path = front.future / "bed" / "raw_model.obj"
+    plain = ModelBank(front.future).load("bed")
+    count = sum(line.startswith("v ") for line in path.read_text().splitlines())
+    corners = [(-30, -30), (30, -30), (30, 30), (-30, 30)]
+    shadow = "".join(f"v {x} 0 {z}\n" for x, z in corners)
+    face = "f " + " ".join(str(count + k) for k in range(1, 5))
+    path.write_text(f"{path.read_text().rstrip()}\n{shadow}{face}\n")
+    bank = ModelBank(front.future)
+    assert bank.load("bed").vertices_m.tolist() == plain.vertices_m.tolist()
+    large = "".join(f"v {100 * x} {100 * y} {z}\n" for x in (0, 1) for y in (0, 2) for z in (0, 50))
+    path.write_text(large + "f 1 2 4 3\nf 5 6 8 7\nf 1 2 6 5\nf 3 4 8 7\nf 1 3 7 5\nf 2 4 8 6\n")
+    assert ModelBank(front.future).load("bed").vertices_m.max(axis=0).tolist() == [1.0, 2.0, 0.5]
