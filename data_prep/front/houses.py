@@ -69,7 +69,7 @@ def house_files(folder: Path) -> list[Path]:
 
 def parse_house(path: Path) -> House:
     """Read the JSON of one house; raises InputError if the file is not a house."""
-    data = read_json(path)
+    data = read_json(path, is_text=False)  # rooms with ids that are none are told one by one
     lists: dict[str, list[Any]] = {}
     for key in ("furniture", "mesh", "scene.room"):
         found = data

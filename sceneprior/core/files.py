@@ -8,6 +8,7 @@ import hashlib
 import io
 import json
 import os
+import re
 import secrets
 import stat
 import sys
@@ -247,12 +248,12 @@ def read_text(path: Path, most: int = _MOST_TEXT, hint: str = "") -> str:
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-def read_json(path: Path, most: int = _MOST_TEXT, hint: str = "") -> Any:
-    """Read a JSON file."""
+def read_json(path: Path, most: int = _MOST_TEXT, hint: str = "", is_text: bool = True) -> Any:
+    """Read a JSON file; with `is_text`, strings that cannot be written are refused."""
     try:
         content = read_bytes(path, most, hint)
         found = json.loads(content)
-        if b"\\ud" in content or b"\\uD" in content:  # half a character could not be written
+        if is_text and re.search(rb"\\u[dD]", content):  # half a character could not be written
             json.dumps(found, ensure_ascii=False).encode()
         return found
     except InputError:

@@ -131,9 +131,8 @@ def read_obj(path: Path) -> Mesh:
     """Read the triangles of a Wavefront OBJ, without materials, normals and unused vertices."""
     vertices: list[list[str]] = []
     polygons: list[list[str]] = []
-    text = obj_text(path)
     try:
-        for line in text.splitlines():
+        for line in obj_text(path).splitlines():
             if line.startswith("v "):
                 vertices.append(line.split()[1:4])
             elif line.startswith("f "):
@@ -148,6 +147,8 @@ def read_obj(path: Path) -> Mesh:
         used, faces = np.unique(faces, return_inverse=True)
         points = points[used]
     except (ValueError, IndexError, OverflowError) as error:
+        if isinstance(error, InputError):
+            raise
         raise InputError(f"{path.parent.name}/{path.name} cannot be read ({error})") from None
     if not len(used) or used[0] < 0 or not np.isfinite(points).all():
         raise InputError(f"{path.parent.name}/{path.name} holds no usable triangles")
