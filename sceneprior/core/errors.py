@@ -3,6 +3,7 @@ what to do."""
 
 import errno
 import os
+import re
 
 _ADVICE = {
     errno.EAGAIN: "another program has it open for writing: wait until it has ended. If none has, "
@@ -83,6 +84,7 @@ def sentence_of(error: Exception) -> str | None:
 def cause_of(error: Exception) -> str:
     """Why a file cannot be read, and what to do: 'Permission denied: change its permissions'."""
     if not isinstance(error, OSError) or error.errno is None:
-        return shortened(error, 300) or type(error).__name__
+        # The next sentences of libraries are for those who build them.
+        return re.split(r"(?<=\w)\. (?=[A-Z])", shortened(error, 300))[0] or type(error).__name__
     advice = _ADVICE.get(error.errno) if error.errno != errno.ENOENT else None
     return os.strerror(error.errno) + (f": {advice}" if advice else "")

@@ -93,17 +93,16 @@ def f_score(
 
 def upright_box_iou_3d(a: Mesh, b: Mesh) -> float:
     """Intersection over union of the tightest upright boxes around two meshes, each over the
-        footprint's rectangle of least area; 0 for boxes without volume.
+    footprint's rectangle of least area; 0 for boxes without volume.
 
-        Example: a cube and the same cube turned by 45 degrees share a regular octagon.
+    Example: a cube and the same cube turned by 45 degrees share a regular octagon.
 
-            >>> from sceneprior.core.boxes import yaw_rotation
-            >>> from sceneprior.evaluation.score_table import Number
-    from sceneprior.render.appearance import box_mesh
-            >>> cube = box_mesh((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
-            >>> turned = Mesh(cube.vertices_m @ yaw_rotation(np.pi / 4), cube.faces)
-            >>> round(upright_box_iou_3d(cube, turned), 6)
-            0.707107
+        >>> from sceneprior.core.boxes import yaw_rotation
+        >>> from sceneprior.render.appearance import box_mesh
+        >>> cube = box_mesh((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+        >>> turned = Mesh(cube.vertices_m @ yaw_rotation(np.pi / 4), cube.faces)
+        >>> round(upright_box_iou_3d(cube, turned), 6)
+        0.707107
     """
     points = [np.asarray(mesh.vertices_m, dtype=np.float64) for mesh in (a, b)]
     plans = [shapely.MultiPoint(each[:, ::2]).minimum_rotated_rectangle for each in points]

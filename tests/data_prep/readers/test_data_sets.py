@@ -175,11 +175,12 @@ def test_floors_and_splits_of_structured3d(room, tmp_path):
 
 
 def one_by_one(instances, semantics):
-    """The rule as a loop: the most frequent class of each instance, the lowest id among equals."""
+    """The rule as a loop: the most frequent class of each instance, the lowest id among equals; no
+    class loses against any other."""
     classes = {}
     for instance in set(instances.ravel().tolist()) - {-1}:
         own = [max(int(s), 0) for s in semantics[instances == instance]]
-        best = max(sorted(set(own)), key=own.count)
+        best = max(sorted(set(own)), key=lambda s: (own.count(s), s > 0))
         classes[instance + 1] = NYU40[best - 1] if best else "void"
     ids, stuff = np.zeros_like(instances), np.zeros_like(instances)
     for place in np.ndindex(instances.shape):
