@@ -40,15 +40,15 @@ MAY_TOO = {
 }
 
 BUDGET = {
-    "data_prep": (12648, 59),
-    "sceneprior/core": (5733, 28),
+    "data_prep": (12671, 59),
+    "sceneprior/core": (5764, 28),
     "sceneprior/furniture": (588, 4),
-    "sceneprior/render": (4490, 23),
+    "sceneprior/render": (4562, 23),
     "sceneprior/training": (928, 5),
     "sceneprior/paper": (2406, 12),
     "sceneprior/lifted": (8170, 41),
     "sceneprior/baselines": (2909, 14),
-    "sceneprior/evaluation": (4558, 21),
+    "sceneprior/evaluation": (4557, 21),
     "sceneprior/interchange": (892, 5),
     "sceneprior/apps": (6272, 34),
 }
