@@ -33,7 +33,7 @@ LONGEST = 2000
 _UNIT = r"\s*(?:m|metres?|meters?)?"
 _SIZE = re.compile(rf"(\d+\.?\d*){_UNIT}\s*(?:x|×|by)\s*(\d+\.?\d*){_UNIT}\b(?!\s*[cm]m\b)")
 _LENGTH = re.compile(r"\d+\.?\d*\s*(?:mm|cm|m|metres?|meters?|centimetres?|centimeters?)\b")
-_NEGATIVE = re.compile(r"(?:(?<!\w)|(?<=[x×]))[-−]\d[\w.]{0,9}")
+_NEGATIVE = re.compile(r"(?:(?<!\w)|(?<=[^-−][x×]))[-−]\d[\w.]{0,9}")
 _SIZE_TOKEN = "#"
 """Token for the size of the floor, so that it is not mistaken for the size of furniture."""
 _TOKEN = re.compile(r"[a-z_']+|\d+(?:\.\d+)?|\S")
@@ -210,7 +210,7 @@ class _Reader:
         counts += [CountWish(group.noun, 0, 0, group.said) for group in bare if not group.number]
         implied = {wish.target for wish in self.relations}.intersection(OPENINGS)
         for group in bare:
-            if group.new or not group.number or group.noun in implied:
+            if group.new or not group.number or (group.number == 1 and group.noun in implied):
                 continue
             # "The two beds" are all beds, unless beds are named elsewhere.
             most = group.number if group.counted and group.noun not in exact else None
@@ -245,8 +245,7 @@ class _Reader:
         if subject is None or (not to_room and (target is None or subject.noun in OPENINGS)):
             self.strange.append(token.text)
             return True
-        self.subject = subject
-        count = 1 if subject.sign == "<=" else max(subject.number, 1)
+        self.subject, count = subject, 1 if subject.sign == "<=" else max(subject.number, 1)
         self.relations.append(RelationWish(subject.noun, token.value, target, count))
         return True
 
@@ -299,10 +298,11 @@ class _Reader:
             self.strange.append(wall.text)
         elif group.new and group.sign != "<=":
             self.openings += [named] * group.number
-        elif wall and named not in self.openings:  # "the door in the north wall"
-            if group.noun in self.openings:
-                self.openings.remove(group.noun)
-            self.openings.append(named)
+        elif wall:  # "the two doors in the north wall"
+            for _ in range(group.number - self.openings.count(named)):
+                if group.noun in self.openings:
+                    self.openings.remove(group.noun)
+                self.openings.append(named)
 
     def _room(self, number: int | None, bound: _Token | None) -> bool:
         """Read a room type, and refuse a type that the prior does not draw."""

@@ -168,5 +168,18 @@ def test_no_json_ends_raw(value, part):
         assert_sentence(str(error))
 
 
+@pytest.mark.parametrize(("text", "doors"), [
+    ("the two doors and a desk near the door", [None, None]),
+    ("a desk near the two doors", [None, None]),
+    ("the two doors in the north wall", ["north", "north"]),
+    ("two doors, the door in the north wall", [None, "north"]),
+    ("a door in the north wall, a desk near the door in the north wall", ["north"]),
+    ("a 4-x-3 m bedroom", []),
+])  # fmt: skip
+def test_all_doors_that_a_sentence_names_are_added(text, doors):
+    found = RoomRequest.of(want=text).conditions(("desk",), "front3d_bedroom", 13)
+    assert [each.wall for each in found.openings] == doors
+
+
 def assert_sentence(text: str) -> None:
     assert len(text) < 1200 and "\n" not in text and text.rstrip(")").endswith((".", "?"))
