@@ -340,7 +340,7 @@ def run_job(
         made += f", {summary.shards_open} still to make: run without --only"
     drawn = f"; {summary.renderer}" if summary.renderer else ""
     typer.echo(f"{out}: {summary} ({made}{drawn})")
-    if verified and not summary.shards_open:
+    if verified and not summary.shards_open and summary.statuses.get("prepared"):
         from data_prep.inspection.tables import verdict
         from data_prep.inspection.verify import verify
 

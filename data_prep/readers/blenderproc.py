@@ -173,7 +173,7 @@ def _read_frame(path: Path) -> tuple[np.ndarray, list[_Part]]:
         raise InputError(
             f"{path}: instance_attribute_maps is not JSON ({reason}); {_HINT}."
         ) from None
-    parts = checked(_Parts, rows, f"{path}, instance_attribute_maps").root
+    parts = checked(_Parts, rows, f"{path}, instance_attribute_maps", hint=_HINT).root
     return image, [part for part in parts if part.inst_mark and "layout" not in part.inst_mark]
 
 

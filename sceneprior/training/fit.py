@@ -24,7 +24,6 @@ from sceneprior.training.callbacks import (
     StepSeed,
     check_resumable,
     first_process,
-    not_resumed,
     requeue_on_signal,
     slurm_plugins,
     write_checkpoint,
@@ -204,11 +203,15 @@ def _train(
     except (
         TypeError, ValueError, LookupError, AttributeError, ArithmeticError, RuntimeError
     ) as error:  # fmt: skip
-        # What is wrong in a checkpoint may show as late as in its first step or epoch.
+        # What is wrong in a checkpoint may show as late as in its first epoch, but so may others.
         own = isinstance(error, InputError | FloatingPointError | torch.OutOfMemoryError)
         if start is None or rolling.written or own:
             raise
-        raise not_resumed(start, f"{type(error).__name__}: {cause_of(error)}") from None
+        raise InputError(
+            f"Training ended in the first epoch after it was resumed from {start} "
+            f"({type(error).__name__}: {cause_of(error)}). If a run from the start ends so, too, "
+            "the checkpoint is not the cause."
+        ) from error
     write_checkpoint(trainer, folder, "final.ckpt")
 
 

@@ -252,6 +252,20 @@ def test_a_spoilt_checkpoint_is_not_resumed_from(toy_shards, tmp_path, begun_run
         fit(tiny_config(toy_shards, layout__epochs=2), run, resume=True, trainer_options=CPU)
 
 
+def test_an_intact_checkpoint_is_not_blamed(toy_shards, tmp_path, begun_run, monkeypatch):
+    """What ends the first epoch after a resume may be anything, and the checkpoint is kept."""
+    run = shutil.copytree(begun_run, tmp_path / "run")
+
+    def killed(*_):
+        raise RuntimeError("DataLoader worker (pid 1) is killed by signal: Bus error.")
+
+    monkeypatch.setattr("sceneprior.paper.stages.LayoutStage.training_step", killed)
+    with refused("training/resumed, then ended", tmp=tmp_path):
+        fit(tiny_config(toy_shards, layout__epochs=2), run, resume=True, trainer_options=CPU)
+    saved = (run / "layout" / "last.ckpt").read_bytes()
+    assert saved == (begun_run / "layout" / "last.ckpt").read_bytes()
+
+
 @pytest.fixture(scope="module")
 def begun_run(toy_shards, tmp_path_factory):
     """Stopped in its first stage, after one epoch."""
