@@ -162,7 +162,7 @@ class Habits:
         for scene in rooms:
             for key, found in checks(scene, habits).items():
                 outcomes[key] += found
-        passed = {key for key, found in outcomes.items() if np.mean(found or [0]) >= EXPECTED}
+        passed = {key for key, found in outcomes.items() if found and np.mean(found) >= EXPECTED}
         return replace(habits, faults=frozenset(passed))
 
 
