@@ -125,18 +125,21 @@ def _without_shadow(mesh: Mesh) -> Mesh:
         return mesh
     from trimesh.graph import connected_component_labels
 
-    faces = np.asarray(mesh.faces)
+    # Exporters repeat the corners of panels, which alone would be flat parts.
+    same = np.unique(mesh.vertices_m, axis=0, return_inverse=True)[1].reshape(-1)
+    faces, corners_m = same[mesh.faces], mesh.vertices_m[mesh.faces]
     edges = np.concatenate([faces[:, :2], faces[:, 1:]])
-    part = connected_component_labels(edges, len(mesh.vertices_m))
-    sizes = np.array(
-        [np.ptp(mesh.vertices_m[part == k], axis=0) for k in range(int(part.max()) + 1)]
-    )
-    large = sizes.max(axis=1) > _NO_FURNITURE_M
-    shadow = large & (sizes.min(axis=1) < _FLAT_M)
+    part = connected_component_labels(edges, int(same.max()) + 1)[faces[:, 0]]
+    low_m, high_m = np.full((2, int(part.max()) + 1, 3), [[[np.inf]], [[-np.inf]]])
+    np.minimum.at(low_m, part, corners_m.min(axis=1))
+    np.maximum.at(high_m, part, corners_m.max(axis=1))
+    sides_m = (high_m - low_m)[part]
+    large = sides_m.max(axis=1) > _NO_FURNITURE_M
+    shadow = large & (sides_m.min(axis=1) < _FLAT_M)
     if shadow.all() or (large & ~shadow).any():
         return mesh
-    used, kept = np.unique(faces[~shadow[part[faces[:, 0]]]], return_inverse=True)
-    return Mesh(mesh.vertices_m[used], kept.reshape(-1, 3).astype(faces.dtype))
+    used, kept = np.unique(mesh.faces[~shadow], return_inverse=True)
+    return Mesh(mesh.vertices_m[used], kept.reshape(-1, 3).astype(mesh.faces.dtype))
 
 
 def unit_of(mesh: Mesh, entry: dict[str, Any]) -> float:

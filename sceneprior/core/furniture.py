@@ -99,10 +99,12 @@ def class_of_category(category: str, label_set_name: str) -> str:
 
 
 def obj_text(path: Path) -> str:
-    """Read an OBJ as readers expect it, who know neither tabs, indents and continued lines nor
-    indices that count back from the line in which they stand."""
-    text = read_bytes(path).decode("utf-8", errors="replace")
-    text = re.sub(r"\\\r?\n", " ", text).replace("\t", " ")
+    """Read an OBJ as readers expect it, who know neither byte order marks, tabs, indents, continued
+    lines and comments behind numbers, nor indices that count back from the line in which they
+    stand."""
+    text = read_bytes(path).decode("utf-8-sig", errors="replace").replace("\t", " ")
+    text = re.sub(r"\\ *\n", " ", text.replace("\r\n", "\n").replace("\r", "\n"))
+    text = _REMARK.sub(r"\1", text) if "#" in text else text
     if not _UNUSUAL.search(text):
         return text
     number = dict.fromkeys(("v", "vt", "vn"), 0)
@@ -124,6 +126,7 @@ def obj_text(path: Path) -> str:
     return "\n".join(lines)
 
 
+_REMARK = re.compile(r"^( *(?:v|vt|vn|f) [^#\n]*)#.*", re.MULTILINE)
 _UNUSUAL = re.compile(r"^ +\S|^[flp] .*-\d", re.MULTILINE)
 
 

@@ -31,23 +31,42 @@ def load_parts(
     """The meshes of a GLB or an OBJ by node name, with the transforms of their nodes applied.
 
     A damaged file may raise any exception. A GLB that needs an extension that is not read here,
-    such as Draco's compression, raises an `InputError`.
+    such as Draco's compression, raises an `InputError`; so does, with materials, an image that
+    cannot be read.
 
     Args:
         file_type: Format of the file; None uses its suffix.
     """
     import trimesh
+    from PIL import Image
 
     content, kind = read_bytes(path), file_type or Path(path).suffix.lower().removeprefix(".")
     if kind == "obj":
         content = obj_text(path).encode()
     elif content.startswith(b"glTF"):
-        content = _plain_glb(content)
+        content = _plain_glb(content, with_materials)
+    lost: list[str] = []
+
+    class Beside(trimesh.resolvers.FilePathResolver):
+        """Files beside the model; notes images that cannot be read, which trimesh leaves out."""
+
+        def get(self, name: str) -> bytes:
+            try:
+                found: bytes = super().get(name)
+                if not name.lower().endswith((".mtl", ".bin")):
+                    Image.open(io.BytesIO(found))
+            except Exception:
+                lost.extend([] if name.lower().endswith(".mtl") else [name])
+                raise
+            return found
+
     # process=False keeps vertices and faces as written.
     loaded = trimesh.load_scene(
         io.BytesIO(content), file_type=kind, process=False, skip_materials=not with_materials,
-        resolver=trimesh.resolvers.FilePathResolver(str(path)),
+        resolver=Beside(str(path)),
     )  # fmt: skip
+    if lost:
+        raise InputError(f"its file {shown(lost[0])} is missing, or no PNG, JPEG or WebP")
     parts = {}
     for node in loaded.graph.nodes_geometry:
         transform, name = loaded.graph[node]
@@ -58,14 +77,14 @@ def load_parts(
     return parts
 
 
-_READ = ("KHR_lights_punctual", "KHR_materials_", "KHR_mesh_quantization")
+_READ = ("EXT_texture_webp", "KHR_lights_punctual", "KHR_materials_", "KHR_mesh_quantization")
 """Beginnings of the names of extensions that a GLB may require."""
 _PREFIX = struct.Struct("<4sIIII")
 _WHOLE = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2"}
 _WIDTH = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
 
-def _plain_glb(content: bytes) -> bytes:
+def _plain_glb(content: bytes, with_materials: bool) -> bytes:
     """A GLB whose normalized whole numbers are floats, since trimesh takes them as they are."""
     _, version, _, length, _ = _PREFIX.unpack_from(content)
     start = _PREFIX.size
@@ -76,6 +95,8 @@ def _plain_glb(content: bytes) -> bytes:
             f"it needs {shown(unknown[0])}, which is not read here; export it again as a plain "
             "GLB, without compressed meshes or textures."
         )
+    if with_materials:
+        _check_images(data, content[start + length + 8 :])
     chosen = {
         attributes[name]
         for mesh in data.get("meshes", [])
@@ -116,6 +137,27 @@ def _plain_glb(content: bytes) -> bytes:
         + struct.pack("<I4s", len(packed), b"BIN\0")
         + packed
     )
+
+
+def _check_images(data: dict[str, Any], packed: bytes) -> None:
+    """Raise an `InputError` if an image within a GLB cannot be decoded, such as KTX2."""
+    from PIL import Image
+
+    for texture in data.get("textures", []):
+        of = texture.get("extensions", {})
+        source = of.get("EXT_texture_webp", texture).get("source")
+        image = {"mimeType": ", ".join(of)} if source is None else data["images"][source]
+        if "uri" in image:
+            continue  # trimesh asks for it
+        try:
+            view = data["bufferViews"][image["bufferView"]]
+            at = view.get("byteOffset", 0)
+            Image.open(io.BytesIO(packed[at : at + view["byteLength"]]))
+        except (OSError, KeyError):
+            raise InputError(
+                f"an image of type {shown(image.get('mimeType'))} cannot be decoded; export it "
+                "again with images as PNG or JPEG"
+            ) from None
 
 
 def joined(parts: Iterable[Textured]) -> Mesh:

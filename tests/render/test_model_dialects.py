@@ -1,5 +1,6 @@
 """One mesh as other programs write it: every dialect of OBJ and GLB reads as the same triangles."""
 
+import io
 import json
 import struct
 from pathlib import Path
@@ -7,13 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
 
-from sceneprior.apps.retrieval.cad_models import read_glb
-from sceneprior.core.errors import InputError
+from sceneprior.apps.retrieval.cad_models import read_glb, read_textured
+from sceneprior.core.errors import InputError, InputWarning
 from sceneprior.core.furniture import read_obj
 from sceneprior.render.model_files import joined, load_parts
 
-DIALECTS = ("plain", "negative", "tabs", "indents", "continued", "crlf", "all")
+DIALECTS = (
+    "plain", "negative", "tabs", "indents", "continued", "crlf", "cr", "bom", "remarks", "all"
+)  # fmt: skip
 
 
 def two_boxes() -> list[trimesh.Trimesh]:
@@ -36,21 +42,25 @@ WANTED = triangles(*(
 def write_obj(path: Path, dialect: str) -> None:
     """Two groups, each with its own vertices before its faces, as most exporters write them."""
     has = {dialect} if dialect != "all" else set(DIALECTS)
-    lines, before = ["# a chair", "mtllib chair.mtl"], 0
+    lines, before = [] if "bom" in has else ["# a chair", "mtllib chair.mtl"], 0
     for number, mesh in enumerate(two_boxes()):
-        lines += [f"o part{number}", f"g part{number}", "vn 0 1 0"]
         lines += ["v " + " ".join(f"{x:g}" for x in vertex) for vertex in mesh.vertices]
+        lines += [f"o part{number}", f"g part{number}", "vn 0 1 0"]
         for face in mesh.faces:
             at = face - len(mesh.vertices) if "negative" in has else face + 1 + before
             corners = [f"{k}//{-1 if 'negative' in has else number + 1}" for k in at]
-            gap = " \\\n" if "continued" in has else " "
+            gap = " \\ \n" if "continued" in has else " "
             lines.append(f"f {corners[0]} {corners[1]}{gap}{corners[2]}")
         before += len(mesh.vertices)
+    if "remarks" in has:
+        lines = [f"{line} # {line}" if line[0] in "vf" else line for line in lines]
     if "tabs" in has:
         lines = [line.replace(" ", "\t", 1) for line in lines]
     if "indents" in has:
         lines = ["  " + line for line in lines]
-    path.write_bytes(("\r\n" if "crlf" in has else "\n").join(lines).encode())
+    end = "\r" if dialect == "cr" else "\r\n" if "crlf" in has else "\n"
+    text = "\n".join(lines).replace("\n", end)
+    path.write_bytes(text.encode("utf-8-sig" if "bom" in has else "utf-8"))
 
 
 @pytest.mark.parametrize("dialect", DIALECTS)
@@ -126,3 +136,57 @@ def test_extensions_that_are_not_read_are_refused_by_name(tmp_path, name):
     path.write_bytes(glb_of("f4", (name,)))
     with pytest.raises(InputError, match=rf"chair\.glb .*needs '{name}'.*plain GLB"):
         read_glb(path)
+
+
+@pytest.mark.parametrize("image", ["PNG", "WEBP", "KTX2", "none"])
+@pytest.mark.parametrize("suffix", [".glb", ".obj"])
+def test_a_texture_is_read_or_its_loss_is_said(tmp_path, suffix, image):
+    packed = io.BytesIO(b"\xabKTX 20\xbb")
+    if image in ("PNG", "WEBP"):
+        Image.new("RGB", (9, 9), "red").save(packed, image)
+    path = tmp_path / f"chair{suffix}"
+    uv = "".join(f"vt {x} {y}\n" for x, y in ((0, 0), (1, 0), (1, 1)))
+    text = f"mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 1 1 0\n{uv}usemtl a\nf 1/1 2/2 3/3\n"
+    (tmp_path / "a.mtl").write_text("newmtl a\nmap_Kd a.image\n")
+    if suffix == ".glb":
+        chair = trimesh.load_scene(io.BytesIO(text.encode()), "obj", process=False).to_mesh()
+        material = PBRMaterial(baseColorTexture=Image.new("RGB", (9, 9)))
+        chair.visual = TextureVisuals(uv=[[0, 0], [1, 0], [1, 1]], material=material)
+        extra = {"images": [{"uri": "a.image"}]}
+        path.write_bytes(with_json(trimesh.Scene(chair).export(file_type="glb"), extra))
+    else:
+        path.write_text(text)
+    if image != "none":
+        (tmp_path / "a.image").write_bytes(packed.getvalue())
+    if image in ("PNG", "WEBP"):
+        assert read_textured(path)[0].material.baseColorTexture.size == (9, 9)
+        return
+    with pytest.warns(
+        InputWarning, match=r"colour of its class.*'a\.image' is missing, or no PNG"
+    ):
+        assert read_textured(path) == ()
+
+
+def with_json(glb: bytes, extra: dict) -> bytes:
+    """A GLB with other entries in its JSON."""
+    length = struct.unpack_from("<I", glb, 12)[0]
+    text = json.dumps(json.loads(glb[20 : 20 + length]) | extra).encode()
+    text += b" " * (-len(text) % 4)
+    rest = glb[20 + length :]
+    head = (b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A)
+    return struct.pack("<4sIIII", *head) + text + rest
+
+
+def test_an_image_within_a_glb_that_cannot_be_decoded_is_said(tmp_path):
+    box = trimesh.creation.box()
+    material = PBRMaterial(baseColorTexture=Image.new("RGB", (9, 9)))
+    box.visual = TextureVisuals(uv=np.zeros((8, 2)), material=material)
+    path, glb = tmp_path / "box.glb", trimesh.Scene(box).export(file_type="glb")
+    path.write_bytes(glb.replace(b"\x89PNG\r\n", b"\xabKTX 2"))
+    with pytest.warns(InputWarning, match="type 'image/png' cannot be decoded; export"):
+        assert read_textured(path) == ()
+    ktx2 = {"textures": [{"extensions": {"KHR_texture_basisu": {"source": 0}}}]}
+    path.write_bytes(with_json(glb, ktx2))
+    with pytest.warns(InputWarning, match="'KHR_texture_basisu' cannot be decoded; export"):
+        assert read_textured(path) == ()
+    assert len(read_glb(path).faces) == 12

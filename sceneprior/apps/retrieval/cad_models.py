@@ -51,8 +51,8 @@ from sceneprior.render.model_files import joined, load_parts
 POINTS = 1024
 """Points per surface; on a surface of 2 m2, one every 4 to 5 cm."""
 SEED = 0
-FORMAT = 2
-"""Version of the cache file; increase it when the sampling of points changes."""
+FORMAT = 3
+"""Version of the cache file; increase it when models are read or sampled otherwise."""
 _FLAT = 1e-9
 """Ratio to the longest side up to which a side counts as flat; flat sides are not scaled."""
 _MESHES_KEPT = 256

@@ -2,7 +2,9 @@
 
 import os
 
+import numpy as np
 import pytest
+import trimesh
 from refusals import refused
 
 from data_prep.front import furnished
@@ -85,3 +87,15 @@ def test_a_plane_of_shadow_is_no_part_of_a_model(front):
     large = "".join(f"v {100 * x} {100 * y} {z}\n" for x in (0, 1) for y in (0, 2) for z in (0, 50))
     path.write_text(large + "f 1 2 4 3\nf 5 6 8 7\nf 1 2 6 5\nf 3 4 8 7\nf 1 3 7 5\nf 2 4 8 6\n")
     assert ModelBank(front.future).load("bed").vertices_m.max(axis=0).tolist() == [1.0, 2.0, 0.5]
+
+
+def test_a_cabinet_in_centimetres_keeps_its_panels(front):
+    """They are flat, large, and have corners of their own; its knob is small."""
+    panels, knob = trimesh.creation.box((80, 180, 40)).triangles, trimesh.creation.box((3, 3, 3))
+    knob.apply_translation((0, 0, 21.5))
+    corners = np.concatenate([panels, knob.triangles]).reshape(-1, 3)
+    lines = [f"v {x} {y} {z}" for x, y, z in corners]
+    lines += [f"f {k} {k + 1} {k + 2}" for k in range(1, len(corners), 3)]
+    (front.future / "bed" / "raw_model.obj").write_text("\n".join(lines))
+    sides_m = np.ptp(ModelBank(front.future).load("bed").vertices_m, axis=0)
+    np.testing.assert_allclose(sides_m, [0.8, 1.8, 0.43], rtol=1e-5)
