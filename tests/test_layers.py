@@ -40,10 +40,10 @@ MAY_TOO = {
 }
 
 BUDGET = {
-    "data_prep": (12671, 59),
-    "sceneprior/core": (5764, 28),
+    "data_prep": (12674, 59),
+    "sceneprior/core": (5767, 28),
     "sceneprior/furniture": (588, 4),
-    "sceneprior/render": (4562, 23),
+    "sceneprior/render": (4604, 23),
     "sceneprior/training": (931, 5),
     "sceneprior/paper": (2406, 12),
     "sceneprior/lifted": (8171, 41),
