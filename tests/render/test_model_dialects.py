@@ -161,9 +161,7 @@ def test_a_texture_is_read_or_its_loss_is_said(tmp_path, suffix, image):
     if image in ("PNG", "WEBP"):
         assert read_textured(path)[0].material.baseColorTexture.size == (9, 9)
         return
-    with pytest.warns(
-        InputWarning, match=r"colour of its class.*'a\.image' is missing, or no PNG"
-    ):
+    with pytest.warns(InputWarning, match=r"colour of its class.*'a\.image' is missing, or no PNG"):
         assert read_textured(path) == ()
 
 
