@@ -88,6 +88,20 @@ class RollingCheckpoint(Callback):
     def __init__(self, folder: Path, extra: dict):
         self.folder, self.extra, self.written = folder, extra, False
 
+    def on_train_start(self, trainer: lightning.Trainer, pl_module) -> None:
+        """Check what was restored: torch's fused optimizers read beyond tensors of other shapes."""
+        if trainer.ckpt_path is None:
+            return
+        for optimizer in trainer.optimizers:
+            for parameter, state in optimizer.state.items():
+                for value in state.values() if isinstance(state, dict) else (state,):
+                    if not isinstance(value, torch.Tensor) or (
+                        value.ndim
+                        and (value.shape, value.dtype) != (parameter.shape, parameter.dtype)
+                    ):
+                        path = Path(str(trainer.ckpt_path))
+                        raise not_resumed(path, "its optimizer's state is of another network")
+
     def on_save_checkpoint(self, trainer, pl_module, checkpoint: dict) -> None:
         checkpoint.update(self.extra)
 
