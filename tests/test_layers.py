@@ -44,7 +44,7 @@ BUDGET = {
     "sceneprior/core": (5767, 28),
     "sceneprior/furniture": (588, 4),
     "sceneprior/render": (4604, 23),
-    "sceneprior/training": (931, 5),
+    "sceneprior/training": (945, 5),
     "sceneprior/paper": (2406, 12),
     "sceneprior/lifted": (8171, 41),
     "sceneprior/baselines": (2909, 14),

@@ -63,7 +63,7 @@ def test_a_mask_to_its_gradient(toy_shards):
         views = next(iter(make_loader(data, config.shape.batch_size, 0, 0)))
         module.training_step(views, 0).backward()
 
-    assert_short(files_of(trip), 22)
+    assert_short(files_of(trip), 23)
 
 
 def test_a_drawn_room_to_its_glb(prior, tmp_path):
