@@ -24,7 +24,7 @@ SECONDS = 60
 
 
 class Outcome(NamedTuple):
-    """What came of the mutations of a format."""
+    """Results of the mutations of a format."""
 
     read: int
     refused: int

@@ -76,7 +76,7 @@ def read_hdf5(path: Path, names: Sequence[str], hint: str) -> list[np.ndarray]:
 
 
 def download(path: Path) -> str:
-    """What to do about a scan's file that is missing or cannot be read."""
+    """Advice about a scan's file that is missing or cannot be read."""
     return f"download it into the scan's folder, or leave {path.parent.name} out of the scans"
 
 

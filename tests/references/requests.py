@@ -1,4 +1,4 @@
-"""Whether a room's JSON meets a request, one object at a time; see docs/requests.md."""
+"""Test of a room's JSON against a request, one object at a time; see docs/requests.md."""
 
 import math
 from typing import Any

@@ -253,7 +253,7 @@ def test_a_spoilt_checkpoint_is_not_resumed_from(toy_shards, tmp_path, begun_run
 
 
 def test_an_intact_checkpoint_is_not_blamed(toy_shards, tmp_path, begun_run, monkeypatch):
-    """What ends the first epoch after a resume may be anything, and the checkpoint is kept."""
+    """An error in the first epoch after a resume may have any cause; the checkpoint is kept."""
     run = shutil.copytree(begun_run, tmp_path / "run")
 
     def killed(*_):

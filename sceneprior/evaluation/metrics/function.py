@@ -125,7 +125,7 @@ def pieces_of(scene: Scene) -> list[Piece]:
 
 @dataclass(frozen=True)
 class Habits:
-    """What is usual in training rooms."""
+    """Usual numbers, sizes and places of furniture in training rooms."""
 
     most: dict[str, int]
     """Largest number of each class in a room; of all `BEDS` together under `beds`."""
@@ -209,7 +209,7 @@ def checks(scene: Scene, habits: Habits) -> dict[str, list[bool]]:
 
 
 def _pairs(pieces: Sequence[Piece]) -> list[bool]:
-    """Whether two nightstands flank one end of the only bed."""
+    """Outcome for the only bed and its two nightstands: they flank one of its ends."""
     beds = [piece for piece in pieces if piece.label in BEDS]
     stands = [piece for piece in pieces if piece.label in NIGHTSTANDS]
     if len(beds) != 1 or len(stands) != 2:
@@ -255,7 +255,7 @@ def _seats(pieces: Sequence[Piece]) -> dict[str, list[bool]]:
 
 
 def _screens(pieces: Sequence[Piece]) -> list[bool]:
-    """Whether each screen and some sofa or bed face each other."""
+    """Outcome for each screen: it and some sofa or bed face each other."""
     seats = [piece for piece in pieces if piece.label in SEATS and piece.front is not None]
     screens = [piece for piece in pieces if piece.label in SCREENS and piece.front is not None]
     if not seats:
@@ -264,7 +264,7 @@ def _screens(pieces: Sequence[Piece]) -> list[bool]:
 
 
 def _fronts(pieces: Sequence[Piece], floor: shapely.Geometry) -> dict[str, list[bool]]:
-    """Whether pieces of `OPENED` classes have free floor before them, and something behind."""
+    """Outcomes for pieces of `OPENED` classes: free floor before them, and something behind."""
     free, backed = [], []
     for piece in pieces:
         if piece.label not in OPENED or piece.front is None or not piece.standing:
