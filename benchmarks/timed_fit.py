@@ -165,6 +165,5 @@ def timed_fit(
     the next one may exceed the device's memory.
     """
     clock = Clock(matmul, ended)
-    options = options | {"callbacks": [clock]}
-    fit(config, run, loggers=("csv",), trainer_options=options)
+    fit(config, run, loggers=("csv",), trainer_options=options, callbacks=[clock])
     return clock.stages

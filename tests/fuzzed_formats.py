@@ -596,7 +596,7 @@ FORMATS["final.ckpt"] = partial(run_file, "shape/final.ckpt")
 @entry("metrics.csv")
 def metrics(folder: Path) -> Entry:
     from sceneprior.apps.experiments.report import read_curves
-    from sceneprior.training.fit import make_logger
+    from sceneprior.training.trainer import make_logger
 
     run = toy_run(folder)
     path = run / "layout" / "metrics.csv"
@@ -628,7 +628,7 @@ def last_checkpoint(folder: Path) -> Entry:
     config, run = tiny_config(folder / "shards", layout__epochs=3), folder / "run"
     options = {"accelerator": "cpu"}
     with contextlib.suppress(KeyboardInterrupt):
-        fit(config, run, trainer_options=options | {"callbacks": [Stop()]}, loggers=())
+        fit(config, run, trainer_options=options, callbacks=[Stop()], loggers=())
     path = shutil.copy(run / "layout" / "last.ckpt", folder / "kept.ckpt")
 
     def read() -> None:
@@ -636,8 +636,7 @@ def last_checkpoint(folder: Path) -> Entry:
         (run / "layout").mkdir(parents=True)
         shutil.copy(path, run / "layout" / "last.ckpt")
         with contextlib.suppress(KeyboardInterrupt):
-            own = options | {"callbacks": [Stop()]}
-            fit(config, run, resume=True, trainer_options=own, loggers=())
+            fit(config, run, True, (), options, [Stop()])
 
     return path, read
 

@@ -31,7 +31,8 @@ def write_kept_run(name: str, config, run: Path) -> None:
     from sceneprior.training.fit import fit
 
     archive = GOLDEN / f"{name}.zip"
-    plain = config.model_dump_json().replace(config.data.shards, "SHARDS")
+    changed = config.model_dump_json(exclude_defaults=True)  # new settings change no kept run
+    plain = changed.replace(config.data.shards, "SHARDS")
     key = hashlib.sha256(plain.encode()).hexdigest()
     if TAKE_RUNS:
         fit(config, run, trainer_options={"accelerator": "cpu"})

@@ -54,16 +54,15 @@ class Poison(Callback):
 def record(config, run: Path, devices: int, **options) -> list[dict[str, torch.Tensor]]:
     """Train, and return the steps of all stages in one list; of several processes, the first's."""
     recorder = Recorder()
-    options = {"accelerator": "cpu", "devices": devices, "callbacks": [recorder], **options}
-    fit(config, run, trainer_options=options, loggers=("csv",))
+    options = {"accelerator": "cpu", "devices": devices, **options}
+    fit(config, run, trainer_options=options, loggers=("csv",), callbacks=[recorder])
     return recorder.steps
 
 
 def poison(config, run: Path, row: int) -> str:
     """Resume a run with two processes after a latent is spoilt, and return the error message."""
-    options = {"accelerator": "cpu", "devices": 2, "callbacks": [Poison(row)]}
     try:
-        fit(config, run, True, ("csv",), options)
+        fit(config, run, True, ("csv",), {"accelerator": "cpu", "devices": 2}, [Poison(row)])
     except FloatingPointError as error:
         return str(error)
     return "nothing"

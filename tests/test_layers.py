@@ -44,13 +44,13 @@ BUDGET = {
     "sceneprior/core": (5767, 28),
     "sceneprior/furniture": (588, 4),
     "sceneprior/render": (4604, 23),
-    "sceneprior/training": (945, 5),
+    "sceneprior/training": (1148, 6),
     "sceneprior/paper": (2406, 12),
     "sceneprior/lifted": (8171, 41),
     "sceneprior/baselines": (2909, 14),
     "sceneprior/evaluation": (4557, 21),
     "sceneprior/interchange": (892, 5),
-    "sceneprior/apps": (6272, 34),
+    "sceneprior/apps": (6277, 34),
 }
 """Most lines and modules of a folder. They go down freely, and up only in a commit that says what
 it bought and what went for it."""

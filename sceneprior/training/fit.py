@@ -2,18 +2,21 @@
 
 import contextlib
 import logging
-import os
+import pkgutil
+import shutil
 import signal
+import subprocess
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import lightning
 import torch
-from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
+from lightning.pytorch.callbacks import Callback
 
+import sceneprior
 from sceneprior.core.checked import shown
 from sceneprior.core.errors import ConfigError, InputError, InputWarning, cause_of
 from sceneprior.core.files import only_writer, read_json, remove_parts
@@ -25,20 +28,11 @@ from sceneprior.training.callbacks import (
     check_resumable,
     first_process,
     requeue_on_signal,
-    slurm_plugins,
     write_checkpoint,
 )
-from sceneprior.training.method import (
-    RunConfig,
-    Stage,
-    read_checkpoint,
-    read_metrics,
-    without_samples,
-)
+from sceneprior.training.method import RunConfig, Stage, read_checkpoint, without_samples
 from sceneprior.training.steps import make_loader
-
-LOGGERS = ("csv", "tensorboard", "wandb")
-"""Names of the loggers that `fit` accepts."""
+from sceneprior.training.trainer import LOGGERS, make_trainer, trainer_arguments, usage_errors
 
 
 def fit(
@@ -47,18 +41,27 @@ def fit(
     resume: bool = False,
     loggers: tuple[str, ...] = ("csv", "tensorboard"),
     trainer_options: dict[str, Any] | None = None,
+    callbacks: Sequence[Callback] = (),
 ) -> None:
     """Train the stages that `config.stages()` lists; config, checkpoints and logs go to `run`.
 
-    `resume` continues an interrupted run, without training its finished stages again. A run that is
-    refused at its start leaves no files behind. `trainer_options` are passed on to Lightning's
-    Trainer (devices, accelerator, precision); `callbacks` among them are called after those of
-    `fit`.
+    A run that is refused at its start leaves no files behind, and neither does one with Lightning's
+    `fast_dev_run`.
+
+    Args:
+        resume: Continue an interrupted run, without training its finished stages again.
+        loggers: Names of `LOGGERS`.
+        trainer_options: Arguments of Lightning's Trainer (devices, precision, max_steps), which
+            replace those of the section `trainer`.
+        callbacks: Lightning's callbacks for every stage, called after those of `fit`.
     """
     run, config = Path(run), config.with_label_set()
     for name in loggers:
         if name not in LOGGERS:
             raise InputError(f"No logger '{name}'; choose from {', '.join(LOGGERS)}.")
+    arguments = trainer_arguments(config, trainer_options or {})
+    if arguments.get("fast_dev_run"):
+        run = run.with_name(f"{run.name}.fast_dev_run")
     previous = None
     with _own_folder(run), requeue_on_signal():
         if first_process():
@@ -68,9 +71,11 @@ def fit(
             if final.is_file():
                 read_checkpoint(final)  # raises an error if it is damaged
             else:
-                options = dict(trainer_options or {})
-                _train(stage, config, final.parent, previous, resume, loggers, options)
+                own = list(callbacks)
+                _train(stage, config, final.parent, previous, resume, loggers, arguments, own)
             previous = final
+        if arguments.get("fast_dev_run") and first_process():
+            shutil.rmtree(run, ignore_errors=True)
 
 
 @contextlib.contextmanager
@@ -124,7 +129,8 @@ def _train(
     previous: Path | None,
     resume: bool,
     loggers: tuple[str, ...],
-    options: dict[str, Any],
+    arguments: dict[str, Any],
+    callbacks: list[Callback],
 ) -> None:
     """Train one stage in its folder to the end, or until Ctrl-C."""
     settings = stage.settings
@@ -140,8 +146,7 @@ def _train(
     said = {"sceneprior": {"room_ids": room_ids, "label_set": config.label_set}}
     rolling = RollingCheckpoint(folder, said)
     callbacks = [
-        RunProgress(f"fit {stage.name} (epochs)"), StepSeed(config.seed), rolling,
-        *options.pop("callbacks", ()),
+        RunProgress(f"fit {stage.name} (epochs)"), StepSeed(config.seed), rolling, *callbacks
     ]  # fmt: skip
     # Lightning's hints are silenced; GPUs that can multiply matrices fast (TF32) may do so.
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
@@ -149,33 +154,11 @@ def _train(
     warnings.filterwarnings("ignore", module="lightning")
     torch.set_float32_matmul_precision("high")
     lightning.seed_everything(config.seed, verbose=False)
-    updates: dict[str, Any] = {
-        "gradient_clip_val": settings.clip_gradient or None,
-        "accumulate_grad_batches": settings.accumulate,
-    }
-    try:
-        trainer = lightning.Trainer(
-            max_epochs=settings.epochs,
-            logger=[make_logger(name, folder) for name in loggers],
-            callbacks=callbacks,
-            plugins=slurm_plugins(),
-            default_root_dir=folder,
-            enable_checkpointing=False,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-            use_distributed_sampler=False,
-            log_every_n_steps=1,
-            **({} if stage.steps_itself else updates),
-            **options,
-        )
-    except (ValueError, TypeError, RuntimeError) as error:
-        given = ", ".join(f"--{name} {value}" for name, value in options.items())
-        raise InputError(f"Lightning cannot train with {given}: {cause_of(error)}") from None
-    if stage.steps_itself and trainer.world_size > 1:
-        raise InputError(
-            f"method: {config.method} trains in one process, but {trainer.world_size} were "
-            "asked for; use --devices 1."
-        )
+    arguments = dict(arguments)
+    if repeated := arguments.pop("overfit_batches", 0):
+        arguments["limit_train_batches"] = repeated
+    trainer = make_trainer(stage, config, folder, loggers, arguments, callbacks)
+    module.save_hyperparameters({**config.model_dump(mode="json", by_alias=True), **_version()})
     # Written only now: a run that is refused leaves no files behind.
     if trainer.is_global_zero:
         folder.mkdir(parents=True, exist_ok=True)
@@ -185,7 +168,7 @@ def _train(
         rooms.to(trainer.strategy.root_device)
     loader = make_loader(
         rooms, settings.batch_size, config.seed, config.data.workers,
-        trainer.global_rank, trainer.world_size,
+        trainer.global_rank, trainer.world_size, repeated=bool(repeated),
     )  # fmt: skip
     last = folder / "last.ckpt"
     start = last if resume and last.is_file() else None
@@ -193,7 +176,8 @@ def _train(
         check_resumable(start, module)
     before = signal.getsignal(signal.SIGINT)
     try:
-        trainer.fit(module, loader, ckpt_path=start, weights_only=True)
+        with usage_errors(arguments):
+            trainer.fit(module, loader, ckpt_path=start, weights_only=True)
     except SystemExit:
         # Lightning answers Ctrl-C with sys.exit(1).
         if not trainer.interrupted:
@@ -212,7 +196,20 @@ def _train(
             f"({type(error).__name__}: {cause_of(error)}). If a run from the start ends so, too, "
             "the checkpoint is not the cause."
         ) from error
+    finally:
+        if "wandb" in loggers:  # otherwise it would log the next stage to the same run
+            pkgutil.resolve_name("wandb:finish")()
     write_checkpoint(trainer, folder, "final.ckpt")
+
+
+def _version() -> dict[str, str]:
+    """The package's version, and its git commit if it runs from a repository."""
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
+    said = {"version": sceneprior.__version__}
+    with contextlib.suppress(OSError, subprocess.CalledProcessError):
+        found = subprocess.run(command, capture_output=True, text=True, check=True)
+        said["commit"] = found.stdout.strip()
+    return said
 
 
 def warn_of_losses(shards: Path, rooms: int) -> None:
@@ -232,25 +229,3 @@ def warn_of_losses(shards: Path, rooms: int) -> None:
             said = f"{unknown} objects of {shards} have no class, and {known} objects have"
             why = f"their names ({named}) are not in the label set, so they are not learned"
             warnings.warn(f"{said} one: {why}.", InputWarning, stacklevel=1)
-
-
-def make_logger(name: str, folder: Path) -> Logger:
-    """Make a logger for a stage's folder; `name` is one of `LOGGERS`.
-
-    The CSV logger appends to the file of an interrupted run.
-    """
-    if name == "tensorboard":
-        return TensorBoardLogger(folder, name="", version="")
-    if name == "csv":
-        # Lightning's CSVLogger deletes an existing file, so it is given the rows of earlier epochs.
-        path = folder / "metrics.csv"
-        before = read_metrics(path)
-        logger = CSVLogger(folder, name="", version="")
-        if before and first_process():
-            logger.experiment.metrics.extend(before)
-            logger.save()
-        return logger
-    from lightning.pytorch.loggers import WandbLogger
-
-    key = os.environ.get("WANDB_API_KEY") or Path("~/.netrc").expanduser().is_file()
-    return WandbLogger(project="sceneprior", save_dir=folder, name=folder.name, offline=not key)

@@ -17,7 +17,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from pydantic import Field, model_validator
@@ -122,6 +122,14 @@ class RunConfig(Section, ABC):
     set are refused."""
     seed: int = Field(0, ge=0, le=LARGEST_SEED)
     data: DataConfig
+    trainer: dict[str, Any] = Field({})
+    """Arguments of Lightning's Trainer, such as {max_steps: 1000, precision: bf16-mixed}. What the
+    sections of the stages set, such as the epochs, is set there."""
+    callbacks: tuple[dict[str, dict[str, Any] | None], ...] = Field((), strict=False)
+    """Lightning callbacks for every stage, each as {class path: arguments}, such as
+    {lightning.pytorch.callbacks.EarlyStopping: {monitor: val/loss}}."""
+    logger: dict[Literal["csv", "tensorboard", "wandb"], dict[str, Any]] = Field({})
+    """Arguments of Lightning's loggers, such as {wandb: {project: rooms, tags: [small]}}."""
 
     remembers_rooms: ClassVar[bool] = False
     """True if each training room has its own latent."""

@@ -2,7 +2,10 @@
 precision, schedule."""
 
 import math
+import shutil
+import warnings
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,10 +16,14 @@ from torch import distributed as dist
 from torch.utils.data import DataLoader, Sampler, default_convert
 
 from sceneprior.core.dataset import BLANK
+from sceneprior.core.errors import InputWarning
 from sceneprior.core.settings import Section
 
 if TYPE_CHECKING:  # importing Lightning takes longer than the rest of loading a prior
     import lightning.pytorch.utilities.types
+
+LOADER_TIMEOUT_S = 600
+"""Time without a batch after which training with worker processes ends with an error."""
 
 
 class DrawSampler(Sampler[list[tuple[int, int]]]):
@@ -25,12 +32,20 @@ class DrawSampler(Sampler[list[tuple[int, int]]]):
     In each step, the `world` processes together draw the rows that a single process with a `world`
     times larger `batch_size` would draw; `rank` is the index of this process. If the last batch has
     fewer rows than there are processes, each process without a row gets a draw of the epoch
-    `BLANK`, for which the data set returns an empty room.
+    `BLANK`, for which the data set returns an empty room. If `repeated`, every epoch is the first.
     """
 
-    def __init__(self, rows: int, batch_size: int, seed: int, rank: int = 0, world: int = 1):
+    def __init__(
+        self,
+        rows: int,
+        batch_size: int,
+        seed: int,
+        rank: int = 0,
+        world: int = 1,
+        repeated: bool = False,
+    ):
         self.rows, self.batch_size, self.seed = rows, batch_size, seed
-        self.rank, self.world = rank, world
+        self.rank, self.world, self.repeated = rank, world, repeated
         self.epoch = 0
         # Lightning sets the epoch of a loader's `sampler` and of its `batch_sampler.sampler`, but
         # not of the `batch_sampler`, so this batch sampler is also its own `sampler`.
@@ -38,7 +53,7 @@ class DrawSampler(Sampler[list[tuple[int, int]]]):
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch (called by Lightning before each epoch)."""
-        self.epoch = epoch
+        self.epoch = 0 if self.repeated else epoch
 
     def __len__(self) -> int:
         return -(-self.rows // (self.batch_size * self.world))
@@ -60,21 +75,44 @@ def make_loader(
     workers: int,
     rank: int = 0,
     world: int = 1,
+    repeated: bool = False,
 ) -> DataLoader:
     """Make a loader of `SceneViews` (from a `ViewDataset`) or `RoomBoxes` (of true boxes).
 
     `workers` processes prefetch masks. Without masks, no workers are used, because boxes and
-    cameras are already in memory or on the GPU.
+    cameras are already in memory or on the GPU; nor are they if shared memory, through which they
+    pass batches, is too small.
     """
     workers = 0 if dataset.masks is None else workers
+    sampler = DrawSampler(len(dataset), batch_size, seed, rank, world, repeated)
+    if workers and _overfill_shared_memory(dataset.__getitems__(next(iter(sampler))), workers):
+        workers = 0
     return DataLoader(
         dataset,
-        batch_sampler=DrawSampler(len(dataset), batch_size, seed, rank, world),
+        batch_sampler=sampler,
         collate_fn=default_convert,
         num_workers=workers,
         persistent_workers=workers > 0,
+        timeout=LOADER_TIMEOUT_S if workers else 0,
         multiprocessing_context="spawn" if workers else None,
     )
+
+
+def _overfill_shared_memory(batch: Any, workers: int) -> bool:
+    """True, with a warning, if the batches that workers prefetch do not fit into /dev/shm."""
+    shared = Path("/dev/shm")
+    each = sum(value.nbytes for value in vars(batch).values() if isinstance(value, Tensor))
+    needed = (2 * workers + 1) * each  # torch's prefetch factor is 2
+    free = shutil.disk_usage(shared).free if shared.is_dir() else needed
+    if needed > free:
+        warnings.warn(
+            f"{workers} workers need {needed / 2**20:.0f} MB of shared memory, but {shared} has "
+            f"{free / 2**20:.0f} MB left, so batches are read without workers; enlarge it (docker "
+            "run --shm-size 2g), or set data.workers to 0.",
+            InputWarning,
+            stacklevel=3,
+        )
+    return needed > free
 
 
 def weighted_sum(

@@ -29,9 +29,11 @@ def fit(
     logger: Annotated[
         list[str] | None, option("Logger: csv, tensorboard or wandb; repeatable.")
     ] = None,
-    devices: Annotated[str, option("Number or list of devices (Lightning).")] = "auto",
-    accelerator: options.Accelerator = "auto",
-    precision: Annotated[str, option("32-true or bf16-mixed (Lightning).")] = "32-true",
+    devices: Annotated[
+        str | None, option("Number or list of devices; short for --set trainer.devices=...")
+    ] = None,
+    accelerator: Annotated[str | None, option("Device to train on: cpu, gpu or auto.")] = None,
+    precision: Annotated[str | None, option("32-true (default) or bf16-mixed.")] = None,
 ) -> None:
     """Train the stages of a run, one after the other."""
     from sceneprior.apps.config import load_config
@@ -51,7 +53,8 @@ def fit(
             said = f"Stopped and saved. Continue with: {go_on}"
         typer.echo(said, err=True)
         raise typer.Exit(130) from None
-    typer.echo(f"Trained: {folder}")
+    dry = settings.trainer.get("fast_dev_run")
+    typer.echo("Every stage can train; nothing is kept." if dry else f"Trained: {folder}")
 
 
 @contextmanager
