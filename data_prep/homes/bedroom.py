@@ -3,16 +3,17 @@
 import numpy as np
 
 from data_prep.homes.furnish import (
-    Furnisher,
     Offers,
     RoomType,
-    along_wall,
     draw_basics,
     draw_extras,
     opposite_the_anchor,
+    reading_corner,
+    storage,
     table_and_seat,
 )
 from data_prep.homes.layout import Piece
+from data_prep.homes.place import Furnisher
 
 COUNTS = {2: 157, 3: 782, 4: 1731, 5: 2057, 6: 1296, 7: 821, 8: 419, 9: 234, 10: 112, 11: 58,
           12: 21, 13: 7}  # fmt: skip
@@ -23,45 +24,43 @@ Rooms with one piece or more than 13 pieces are left out here as well.
 
 BEDS = {"double_bed": 0.70, "single_bed": 0.18, "kids_bed": 0.12}
 
-ANGLED = 0.8
-"""Chance that a seat is rotated off the axes, so that one piece in ten of all furniture is."""
+NIGHTSTANDS = {
+    "double_bed": [0.80, 0.14, 0.06], "single_bed": [0.14, 0.61, 0.25], "kids_bed": [0, 0.6, 0.4],
+}  # fmt: skip
+"""Chances of two, one and no nightstands at each bed."""
+
 LAMP_ANGLED = 0.3
+"""Chance that a lamp is rotated off the axes."""
 
 EXTRAS: Offers = {
     "tv_stand": (1, 0.34),
     "cabinet": (1, 0.30),
-    "desk and chair": (2, 0.24),
-    "dressing_table": (1, 0.10),
-    "dressing_table and dressing_chair": (2, 0.16),
-    "dressing_table and stool": (2, 0.07),
-    "armchair": (1, 0.13),
-    "armchair and table": (2, 0.08),
-    "armchair and coffee_table": (2, 0.07),
-    "bookshelf": (1, 0.12),
+    "desk and chair": (2, 0.34),
+    "dressing_table and dressing_chair": (2, 0.26),
+    "armchair": (1, 0.10),
+    "armchair and table": (2, 0.16),
+    "bookshelf": (1, 0.16),
     "shelf": (1, 0.10),
-    "bench": (1, 0.14),
-    "table": (1, 0.08),
-    "chair": (1, 0.06),
-    "sofa": (1, 0.05),
-    "sofa and coffee_table": (2, 0.06),
-    "children_cabinet": (1, 0.08),
-    "bedside lamps": (2, 0.10),
+    "stool": (1, 0.22),
+    "sofa": (1, 0.04),
+    "sofa and coffee_table": (2, 0.07),
+    "children_cabinet": (1, 0.30),
+    "bedside lamps": (2, 0.07),
 }
 """Furniture of a bedroom besides bed, nightstands, wardrobe and lamp."""
 
 
 def _draw_groups(rng: np.random.Generator, count: int, bed: str) -> list[str]:
-    chances = [0.62, 0.24, 0.14] if bed == "double_bed" else [0.1, 0.55, 0.35]
-    nightstands = int(rng.choice([2, 1, 0], p=chances))
+    nightstands = int(rng.choice([2, 1, 0], p=NIGHTSTANDS[bed]))
     store = "children_cabinet" if bed == "kids_bed" and rng.random() < 0.5 else "wardrobe"
     basics = [("lamp", 1, 0.88), (f"nightstands {nightstands}", nightstands, 1.0), (store, 1, 0.82)]
     groups, left = draw_basics(rng, basics, count)
     offers = {name: offer for name, offer in EXTRAS.items() if name not in groups}
     if "nightstands 2" not in groups or bed != "double_bed":
         del offers["bedside lamps"]
-    if bed == "kids_bed":
-        offers = {name: offer for name, offer in offers.items() if "dressing" not in name}
-    fallback = {name: EXTRAS[name] for name in ("cabinet", "shelf", "table", "chair")}
+    other = "dressing" if bed == "kids_bed" else "children"
+    offers = {name: offer for name, offer in offers.items() if other not in name}
+    fallback = {name: EXTRAS[name] for name in ("cabinet", "shelf", "bookshelf", "stool")}
     return draw_extras(rng, groups, left, offers, fallback)
 
 
@@ -79,10 +78,9 @@ def _place_bed(room: Furnisher, groups: list[str]) -> Piece | None:
 
 
 def _bedside_lamps(room: Furnisher, group: str) -> bool:
-    nightstands = [piece for piece in room.layout.pieces if piece.model.name == "nightstand"]
-    small = sorted(room.catalog["pendant_lamp"], key=lambda model: model.size_m[0])[:4]
+    small = room.smallest("pendant_lamp", 4)
     twin = [small[room.rng.integers(len(small))]]
-    return all([room.hang(twin, (n.x, n.z), n.top + 0.3, 0.0) for n in nightstands[:2]])
+    return all([room.hang(twin, (n.x, n.z), n.top + 0.3, 0.0) for n in room.named("nightstand")])
 
 
 def _sofa(room: Furnisher, group: str) -> Piece | None:
@@ -92,39 +90,21 @@ def _sofa(room: Furnisher, group: str) -> Piece | None:
     return room.before(sofa, room.models("coffee_table", below=1.3), (0.25, 0.4))
 
 
-def _bench(room: Furnisher, group: str) -> object:
-    """Place a bench at the foot of the bed, or a small stool anywhere."""
-    long, small = room.models("stool", above=0.8), room.models("stool", below=0.8)
-    at_foot = room.rng.random() < 0.6 and room.before(room.anchor, long, (0.03, 0.12), tries=6)
-    return at_foot or room.standing_free(small, ANGLED)
-
-
-def _armchair(room: Furnisher, group: str) -> Piece | None:
-    """Place an armchair near a wall, facing the middle of the room, perhaps with a small table."""
-    middle = (room.layout.width / 2, room.layout.depth / 2)
-    chair = room.standing_free(room.catalog["armchair"], ANGLED, middle)
-    _, _, companion = group.partition(" and ")
-    if chair is None or not companion:
-        return chair
-    small = room.models(companion, below=0.9)
-    upright = chair.at(chair.x, chair.z, round(chair.yaw_rad / (np.pi / 2)) * np.pi / 2)
-    before = room.before(upright, small, (0.15, 0.35), angled=0.2, tries=6)
-    return before or room.standing_free(small, 0.2)
+def _stool(room: Furnisher, group: str) -> Piece | None:
+    """Place a bench at the foot of the bed, or a stool at a wall."""
+    long = room.models("stool", above=min(0.8, 0.5 * room.anchor.size_m[0]))
+    at_foot = room.before(room.anchor, long, (0.03, 0.12), (-0.03, 0.03), tries=8)
+    return at_foot or room.against_wall(room.models("stool", below=0.8), corner=0.8)
 
 
 def _lamp(room: Furnisher, group: str) -> Piece | None:
     """Hang a lamp over the middle of the room, or between there and the bed."""
     kind = "pendant_lamp" if room.rng.random() < 0.76 else "ceiling_lamp"
     x, z = room.lamp_position()
-    if room.rng.random() < 0.35:
+    if room.rng.random() < 0.15:
         x, z = (x + room.anchor.x) / 2, (z + room.anchor.z) / 2
-    lamp = room.hang(room.catalog[kind], (x, z), 1.65, LAMP_ANGLED)
-    return lamp or room.hang(room.catalog["ceiling_lamp"], (x, z), 1.65, LAMP_ANGLED)
-
-
-def _loose(room: Furnisher, group: str) -> Piece | None:
-    angled = ANGLED if group == "chair" else 0.2
-    return room.standing_free(room.models(group, below=0.8), angled)
+    lamp = room.hang(room.catalog[kind], (x, z), 1.8, LAMP_ANGLED)
+    return lamp or room.hang(room.catalog["ceiling_lamp"], (x, z), 1.8, LAMP_ANGLED)
 
 
 BEDROOM = RoomType(
@@ -138,20 +118,18 @@ BEDROOM = RoomType(
         "nightstands": lambda room, group: room.twins_beside(
             room.catalog["nightstand"], int(group[-1])
         ),
+        "stool": _stool,
         "tv_stand": opposite_the_anchor,
-        "wardrobe": along_wall(0.5),
-        "children_cabinet": along_wall(0.5),
-        "desk": table_and_seat(ANGLED),
-        "dressing_table": table_and_seat(ANGLED),
+        "wardrobe": storage(0.6),
+        "children_cabinet": storage(0.6),
+        "desk": table_and_seat,
+        "dressing_table": table_and_seat,
         "sofa": _sofa,
-        "bookshelf": along_wall(0.35),
-        "cabinet": along_wall(0.35),
-        "bench": _bench,
+        "bookshelf": storage(0.5),
+        "cabinet": storage(0.6),
         "bedside": _bedside_lamps,
-        "armchair": _armchair,
-        "shelf": along_wall(0.35),
-        "table": _loose,
-        "chair": _loose,
+        "armchair": reading_corner,
+        "shelf": storage(0.4),
         "lamp": _lamp,
     },
     area_m2=(7.5, 1.35),

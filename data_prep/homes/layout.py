@@ -6,6 +6,7 @@ not overlap: stricter than necessary, but it keeps the 3D ground truth free of o
 """
 
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -17,6 +18,9 @@ from sceneprior.furniture.solids import Vector
 Rect = tuple[float, float, float, float]
 """Rectangle on the floor: x0, z0, x1, z1."""
 
+SEATS = ("double_bed", "single_bed", "kids_bed", "sofa", "desk", "dressing_table")
+"""Classes in front of which chairs, benches and coffee tables stand."""
+
 CEILING_GAP_M = 0.03
 """Minimum gap between a tall piece and the ceiling."""
 
@@ -25,6 +29,9 @@ DOOR_M = 0.9
 
 FREE_SHARE = 0.45
 """Minimum share of the floor without furniture."""
+
+WINDOW_CLEAR_M = 0.3
+"""Depth of the floor in front of a window without higher furniture."""
 
 SHOULDERS_M = 0.2
 """Half of the minimum width of a passage."""
@@ -93,6 +100,24 @@ def yaw_at(wall: Wall) -> float:
     return float(np.arctan2(x, z))
 
 
+def rect_at(wall: Wall, middle: float, width: float, depth: float) -> Rect:
+    """Rectangle of floor in front of a part of a wall."""
+    (xa, za), (xb, zb) = (
+        point_by(wall, middle + side * width / 2, off) for side, off in ((-1, 0.0), (1, depth))
+    )
+    return min(xa, xb), min(za, zb), max(xa, xb), max(za, zb)
+
+
+class Window(NamedTuple):
+    """A window: its wall, its middle along the wall, its width, and its heights above the floor."""
+
+    wall: Wall
+    middle: float
+    width: float
+    sill: float
+    top: float
+
+
 def overlaps(a: Rect, b: Rect, gap: float = 0.0) -> bool:
     """Test whether two rectangles are closer than `gap`."""
     in_x = a[0] < b[2] + gap and b[0] < a[2] + gap
@@ -110,9 +135,13 @@ class Layout:
     """Corner rectangle cut out of an L-shaped room."""
     pieces: list[Piece] = field(default_factory=list)
     kept_clear: list[Rect] = field(default_factory=list)
-    """Floor that stays empty: first at the door, then in front of pieces with a clearance."""
+    """Floor that stays empty: first at the door, then in front of storage."""
+    kept_for_seats: list[Rect] = field(default_factory=list)
+    """Floor in front of `SEATS`, for pieces that belong to them."""
     door: tuple[Wall, float] = field(init=False)
     """Wall of the door, and the middle of the door along it."""
+    windows: list[Window] = field(default_factory=list)
+    """Windows; nothing higher than their sills stands before them."""
 
     @property
     def area(self) -> float:
@@ -149,7 +178,7 @@ class Layout:
         return walls_of(np.array(self.outline))
 
     def fits(self, piece: Piece, crowding: bool = False) -> bool:
-        """Test whether the piece fits; with `crowding`, only the door's floor must stay clear."""
+        """Test whether the piece fits; with `crowding`, it may stand on floor kept for seats."""
         rect = piece.rect
         hangs = piece.y > 0
         if not self._holds(rect, 0.004) or piece.top > self.height - (
@@ -160,8 +189,11 @@ class Layout:
             apart = piece.y >= other.top or other.y >= piece.top
             if not apart and overlaps(rect, other.rect, 0.008):
                 return False
-        closed = self.kept_clear[:1] if crowding else self.kept_clear
-        return hangs or not any(overlaps(rect, clear) for clear in closed)
+        closed = self.kept_clear if crowding else self.kept_clear + self.kept_for_seats
+        seen = [
+            rect_at(*each[:3], WINDOW_CLEAR_M) for each in self.windows if piece.top > each.sill
+        ]
+        return hangs or not any(overlaps(rect, clear) for clear in [*closed, *seen])
 
     def add(self, piece: Piece, clearance: float = 0.0, crowding: bool = False) -> bool:
         """Add the piece if it fits, and keep `clearance` metres in front of it clear."""
@@ -172,7 +204,8 @@ class Layout:
             standing = [other.rect for other in self.pieces if other.y == 0]
             if not self._holds(clear) or any(overlaps(clear, other) for other in standing):
                 return False
-            self.kept_clear.append(clear)
+            seat = piece.model.name in SEATS
+            (self.kept_for_seats if seat else self.kept_clear).append(clear)
         self.pieces.append(piece)
         return True
 
@@ -207,13 +240,23 @@ def empty_room(
     # The door is near one end of a wall, and the floor in front of it stays clear.
     walls = [wall for wall in layout.walls if wall.length_m > 1.8]
     wall = walls[rng.integers(len(walls))]
-    half, middle = DOOR_M / 2, 0.1 + DOOR_M / 2
+    middle = 0.1 + DOOR_M / 2
     if rng.random() < 0.5:
         middle = wall.length_m - middle
     layout.door = wall, middle
-    x, z = point_by(wall, middle, half)
-    layout.kept_clear.append((x - half, z - half, x + half, z + half))
+    layout.kept_clear.append(rect_at(wall, middle, DOOR_M, DOOR_M))
+    others = [other for other in walls if other is not wall]
+    for other in rng.permutation(len(others))[: rng.choice([1, 2], p=[0.7, 0.3])]:
+        layout.windows.append(_window(rng, others[other]))
     return layout
+
+
+def _window(rng: np.random.Generator, wall: Wall) -> Window:
+    """Sample a window near the middle of a wall."""
+    width = round(rng.uniform(0.9, min(2.1, wall.length_m - 0.8)), 2)
+    middle = wall.length_m / 2 + rng.uniform(-0.2, 0.2) * (wall.length_m - width)
+    sill = float(rng.choice([0.8, 0.9, 1.0]))
+    return Window(wall, round(middle, 2), width, sill, float(rng.choice([2.1, 2.2, 2.3])))
 
 
 def is_liveable(layout: Layout, reach: tuple[str, ...]) -> bool:

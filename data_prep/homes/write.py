@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 
 from data_prep.homes.layout import DOOR_M, Layout, Piece, point_by
+from sceneprior.core.shell import Wall
 from sceneprior.furniture.catalog import Model
 
 WALL_M = 0.12
 """Thickness of a wall."""
 _DOOR_HEIGHT_M = 2.0
 _BEFORE_WALL_M = 0.005
-"""Distance by which a door stands in front of its wall, which has no hole."""
+"""Distance by which doors and windows stand in front of their wall, which has no hole."""
 
 _IDENTITY = {"pos": [0, 0, 0], "rot": [0, 0, 0, 1], "scale": [1, 1, 1]}
 
@@ -99,9 +100,9 @@ def house_json(uid: str, rooms: list[PlacedRoom]) -> dict[str, Any]:
 
 
 def shell(layout: Layout) -> list[tuple[str, np.ndarray]]:
-    """Floor, ceiling, walls and door in the room's frame, each as (type, (triangles, 3, 3)).
+    """Floor, ceiling, walls and openings in the room's frame, each as (type, (triangles, 3, 3)).
 
-    Floor, ceiling, inner walls and the door face the room; outer walls face away from it.
+    All but the outer walls face the room.
     """
     (x0, x1), (z0, z1) = layout.beside_notch
     rectangles = [(0.0, z0, layout.width, z1)]  # two if the floor is L-shaped
@@ -120,23 +121,27 @@ def shell(layout: Layout) -> list[tuple[str, np.ndarray]]:
     ends = zip(np.roll(outside, -1, axis=0), outside, strict=True)
     inner = [_wall(wall.start_m, wall.end_m, layout.height) for wall in walls]
     outer = [_wall(*each, layout.height) for each in ends]
-    wall, middle = layout.door
-    start, end = (
-        np.array(point_by(wall, middle + side * DOOR_M / 2, _BEFORE_WALL_M)) for side in (-1, 1)
-    )
     return [
         ("Floor", tiles),
         ("Ceiling", ceiling),
         *(("WallInner", part) for part in inner),
         *(("WallOuter", part) for part in outer),
-        ("Door", _wall(start, end, _DOOR_HEIGHT_M)),
+        ("Door", _opening(*layout.door, DOOR_M, 0.0, _DOOR_HEIGHT_M)),
+        *(("Window", _opening(*window)) for window in layout.windows),
     ]
 
 
-def _wall(start: np.ndarray, end: np.ndarray, height: float) -> np.ndarray:
+def _opening(wall: Wall, middle: float, width: float, bottom: float, top: float) -> np.ndarray:
+    start, end = (
+        np.array(point_by(wall, middle + side * width / 2, _BEFORE_WALL_M)) for side in (-1, 1)
+    )
+    return _wall(start, end, top, bottom)
+
+
+def _wall(start: np.ndarray, end: np.ndarray, top: float, bottom: float = 0.0) -> np.ndarray:
     """Make a wall of two triangles; it faces left of the direction start to end in (x, z)."""
     (x0, z0), (x1, z1) = start, end
-    return _quad((x0, 0.0, z0), (x1, 0.0, z1), (x1, height, z1), (x0, height, z0))
+    return _quad((x0, bottom, z0), (x1, bottom, z1), (x1, top, z1), (x0, top, z0))
 
 
 def _quad(*corners: tuple[float, float, float]) -> np.ndarray:

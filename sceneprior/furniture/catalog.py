@@ -19,12 +19,15 @@ from sceneprior.furniture.tables import DEEP_SOFA_M, DINING_WIDTH_M, build
 VARIANTS = 12
 """Models per class in one data set; the demo promises at least five."""
 
+STYLES = ("Modern", "Japanese", "Vintage/Retro")
+"""Styles that the models of a class take in turn."""
+
 HEIGHT_CORRELATION = {"stool": 0.4, "table": 0.75, "ceiling_lamp": 0.2}
 """Correlation of height (and of depth, unless listed below) with width, where it is not 0.3."""
 
 DEPTH_CORRELATION = {
     "table": 0.9, "stool": 0.8, "ceiling_lamp": 0.97, "sofa": 0.75, "armchair": 0.8, "chair": 0.7,
-    "dressing_chair": 0.8, "pendant_lamp": 0.6,
+    "dressing_chair": 0.8, "pendant_lamp": 0.6, "double_bed": 0.98, "single_bed": 0.98,
 }  # fmt: skip
 """Correlation of depth with width."""
 
@@ -125,7 +128,7 @@ def make_variants(seed: int, name: str) -> list[Model]:
     models = []
     for index, size in enumerate(_sizes(name, rng)):
         jid = str(uuid.uuid5(uuid.NAMESPACE_OID, f"sceneprior homes {seed} {name} {index}"))
-        style_name = ("Modern", "Japanese", "Vintage/Retro")[index % 3]
+        style_name = STYLES[index % len(STYLES)]
         kinds = _category(name, size, index)
         models.append(Model(jid, name, *kinds, style_name, size, index, (*own, index)))
     return models

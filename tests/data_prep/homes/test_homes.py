@@ -106,7 +106,7 @@ def test_command_writes_into_an_empty_folder(tmp_path, cli):
 
 def test_walls_look_in_and_no_furniture_stands_before_the_door(rooms):
     for room in rooms:
-        assert set(room.shell) == {"floor", "wall", "door", "ceiling"} and not room.notes
+        assert set(room.shell) == {"floor", "wall", "door", "window", "ceiling"} and not room.notes
         for kind, triangles in room.shell.items():
             normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
             normal /= np.linalg.norm(normal, axis=1, keepdims=True)
