@@ -45,6 +45,7 @@ def shell_room(
         "floor": [ground],
         "wall": walls,
         "door": [_quad(*DOOR, 2.0)] if outline == L_SHAPE else [],
+        "ceiling": [ground + np.array([0, HEIGHT_M, 0])],
     }
     meshes = [_mesh(parts.get(name, [])) for name in STUFF[1:]]
     poses = np.stack([_pose(eye, yaw, roll) for eye in eyes for yaw in np.arange(8) * np.pi / 4])

@@ -1,4 +1,5 @@
-"""Finds the floor that views show, and the bases of walls and doors, in images of stuff.
+"""Finds the floor that views show, the bases of walls and doors, and the height of the ceiling, in
+images of stuff.
 
 The floor is the plane y = 0, so a pixel of it, or on the lower edge of a wall, is one point of the
 room without any depth.
@@ -43,6 +44,7 @@ _ERROR_PX = 2.0
 _PIXEL_ERROR_M = 0.01
 
 FLOOR, DOOR = STUFF.index("floor"), STUFF.index("door")
+ON_FLOOR, ON_CEILING = np.arange(len(STUFF)) == FLOOR, np.isin(STUFF, "ceiling")
 BARRIER = np.isin(STUFF, ("wall", "door", "window"))
 """True for values of stuff that stand on the floor and hide the space behind them."""
 
@@ -134,15 +136,18 @@ def seen_floor(room: RoomViews) -> shapely.Geometry:
 
 
 def find_walls(
-    room: RoomViews, views: Sequence[int] | np.ndarray | None = None
+    room: RoomViews,
+    views: Sequence[int] | np.ndarray | None = None,
+    ceiling_m: float | None = None,
 ) -> tuple[tuple[Wall, ...], tuple[Door, ...]]:
-    """Find the bases of walls and doors that `views` (None: all) of a room with `stuff` show.
+    """Find the bases of walls and doors that `views` (None: all) of a room with `stuff` show; with
+    `ceiling_m`, its height, the tops of walls in place of bases.
 
     Lines are found one after another, each where most points lie (a Hough transform), and fitted to
     the points near them. Walls may have any direction.
     """
     views = range(len(room.world_to_camera)) if views is None else views
-    every = zip(*(_edges_of_view(room, int(view)) for view in views), strict=True)
+    every = zip(*(_edges_of_view(room, int(view), ceiling_m) for view in views), strict=True)
     edges = _Edges(*(np.concatenate(part) for part in every))
     edges = edges.take(slice(None, None, max(1, len(edges.view) // _MOST_POINTS)))
     walls: list[Wall] = []
@@ -158,7 +163,48 @@ def find_walls(
     return tuple(walls), tuple(doors)
 
 
-def _edges_of_view(room: RoomViews, view: int) -> _Edges:
+def find_ceiling(
+    room: RoomViews, walls: Sequence[Wall], views: Sequence[int] | np.ndarray | None = None
+) -> float | None:
+    """Height in metres of the ceiling that `views` (None: all) of a room with `stuff` show: the
+    median height at which it meets its found walls. None if too few pixels show that."""
+    views = range(len(room.world_to_camera)) if views is None else views
+    found = [np.zeros(0)]
+    for view in map(int, views) if walls else ():
+        pose, K, pixels, _ = _borders(room, view, ON_CEILING, BARRIER)
+        eye, rays = camera_centers(pose), pixel_rays(pixels[::4], pose, K)
+        distances = np.full((len(rays), len(walls)), np.inf)
+        for row, (start, end, inward, _) in enumerate(walls):
+            towards = np.minimum(rays[:, ::2] @ inward, -1e-9)
+            reach = (start - eye[::2]) @ inward / towards
+            along = (eye[::2] + reach[:, None] * rays[:, ::2] - start) @ (end - start)
+            on = (reach > 0) & (along >= 0) & (along <= (end - start) @ (end - start))
+            distances[on, row] = reach[on]
+        nearest = distances.min(axis=1)
+        met = np.isfinite(nearest)
+        found.append(eye[1] + nearest[met] * rays[met, 1])
+    heights_m = np.concatenate(found)
+    return float(np.median(heights_m)) if len(heights_m) >= _LEAST_POINTS else None
+
+
+def _edges_of_view(room: RoomViews, view: int, ceiling_m: float | None) -> _Edges:
+    surfaces = (BARRIER, ON_FLOOR) if ceiling_m is None else (ON_CEILING, BARRIER)
+    pose, K, pixels, kinds = _borders(room, view, *surfaces)
+    points_m, length_m, towards = on_floor(pixels, pose, K, ceiling_m or 0.0)
+    near = length_m < COARSE_M
+    return _Edges(
+        points_m[near], towards[near], length_m[near] ** -2, np.full(near.sum(), view),
+        kinds[near] == DOOR,
+    )  # fmt: skip
+
+
+def _borders(
+    room: RoomViews, view: int, above: Bool[np.ndarray, " stuff"], below: Bool[np.ndarray, " stuff"]
+) -> tuple[
+    Float[np.ndarray, "4 4"], Float[np.ndarray, "3 3"], Float[np.ndarray, "points 2"], np.ndarray
+]:
+    """Pose and intrinsics of a view's stuff, the pixels (x, y) at which stuff of some values ends
+    above stuff of other values, and the upper values."""
     assert room.stuff is not None
     pose = room.world_to_camera[view].astype(np.float64)
     K = thinned_intrinsics(room.intrinsics[view], stuff_step(room.image_size))
@@ -168,36 +214,33 @@ def _edges_of_view(room: RoomViews, view: int) -> _Edges:
     upside_down = up[0 if sideways else 1] > 0
     image = image.T if sideways else image
     image = image[::-1] if upside_down else image
-    rows, columns = np.nonzero((image[1:] == FLOOR) & BARRIER[image[:-1]])
-    kinds = image[rows, columns]
+    rows, columns = np.nonzero(below[image[1:]] & above[image[:-1]])
     along = len(image) - rows - 1 if upside_down else rows + 1
-    # The base is at the boundary of the two pixels.
+    # The border is at the boundary of the two pixels.
     pixels = np.stack([columns + 0.5, along], axis=1)[:, :: -1 if sideways else 1]
-    points_m, length_m, towards = on_floor(pixels, pose, K)
-    near = length_m < COARSE_M
-    return _Edges(
-        points_m[near], towards[near], length_m[near] ** -2, np.full(near.sum(), view),
-        kinds[near] == DOOR,
-    )  # fmt: skip
+    return pose, K, pixels, image[rows, columns]
 
 
 def on_floor(
     pixels: Float[np.ndarray, "points 2"],
     world_to_camera: Float[np.ndarray, "4 4"],
     intrinsics: Float[np.ndarray, "3 3"],
+    height_m: float = 0.0,
 ) -> tuple[
     Float[np.ndarray, "points 2"], Float[np.ndarray, " points"], Float[np.ndarray, "points 2"]
 ]:
-    """Points (x, z) at which the rays through pixels meet y = 0, the length in metres along the ray
-    that one pixel covers there (inf above the horizon), and unit vectors to below the camera."""
+    """Points (x, z) at which the rays through pixels meet the plane y = `height_m`, the length in
+    metres along the ray that one pixel covers there (inf for rays that do not meet it), and unit
+    vectors to the camera's place."""
     eye = camera_centers(world_to_camera)
     focal = intrinsics[[0, 1], [0, 1]]
     rays = pixel_rays(pixels, world_to_camera, intrinsics)
-    down = np.maximum(-rays[:, 1], 1e-9)
-    reach = rays[:, ::2] * (eye[1] / down)[:, None]
+    away = eye[1] - height_m
+    sideways = np.maximum(-rays[:, 1] * np.sign(away), 1e-9)
+    reach = rays[:, ::2] * (abs(away) / sideways)[:, None]
     distance = np.linalg.norm(reach, axis=1)
-    meets = (rays[:, 1] < 0) & (eye[1] > 0)
-    length = np.where(meets, (eye[1] ** 2 + distance**2) / max(eye[1], 1e-9) / focal.mean(), np.inf)
+    meets = rays[:, 1] * away < 0
+    length = np.where(meets, (away**2 + distance**2) / max(abs(away), 1e-9) / focal.mean(), np.inf)
     return eye[::2] + reach, length, -reach / np.maximum(distance, 1e-9)[:, None]
 
 

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import shapely
-from rooms_of_walls import DOOR, L_SHAPE, shell_room
+from rooms_of_walls import DOOR, HEIGHT_M, L_SHAPE, shell_room
 
 from sceneprior.core.classes import STUFF
 from sceneprior.core.observations import stuff_step, thinned_intrinsics
-from sceneprior.core.wall_lines import find_walls, seen_floor
+from sceneprior.core.wall_lines import find_ceiling, find_walls, seen_floor
 
 EYES = [(-1.0, 0.5), (-1.2, -0.8), (0.9, -0.7)]
 TURNED = [(1.2 * x - 0.5 * z, 0.5 * x + 1.2 * z) for x, z in L_SHAPE]
@@ -37,6 +37,18 @@ def test_every_wall_of_an_l_shape_is_found_however_the_camera_is_rolled(roll):
         assert floor.contains(shapely.Point(inside)) and wall.error_m < 0.01
     (door,) = doors
     np.testing.assert_allclose(sorted(ends_of([door]).tolist()), sorted(DOOR), atol=0.06)
+
+
+@pytest.mark.parametrize("roll", range(4))
+def test_the_ceiling_is_as_high_as_where_it_meets_walls_whose_tops_are_above_their_bases(roll):
+    room = shell_room(L_SHAPE, EYES, roll=roll, size=(240, 180))
+    height_m = find_ceiling(room, find_walls(room)[0])
+    assert height_m == pytest.approx(HEIGHT_M, abs=0.01)
+    tops, doors = find_walls(room, ceiling_m=height_m)
+    assert len(tops) >= 4 and distance(ends_of(tops), L_SHAPE) < 0.03 and not doors
+    assert all(shapely.Polygon(L_SHAPE).contains(shapely.Point(
+        (top.start_m + top.end_m) / 2 + 0.1 * top.inward)) for top in tops)  # fmt: skip
+    assert find_ceiling(room, ()) is None and find_ceiling(room, tops, []) is None
 
 
 def test_walls_may_have_any_direction():

@@ -10,6 +10,7 @@ from numba import njit
 from sceneprior.core.cameras import camera_centers, nearest_to_rays
 from sceneprior.core.observations import RoomViews
 from sceneprior.lifted.lifting import LiftedBoxes, RayPool
+from sceneprior.lifted.lifting.hidden_sides import moved_to_planes
 from sceneprior.lifted.lifting.hulls import MOST_EMPTY, NEVER, Hull, Sightings, carve, own_in
 from sceneprior.render.silhouettes.cpu.kernels import in_threads
 
@@ -32,18 +33,23 @@ FAR_M = 100.0
 """Length of rays that no object stops."""
 
 
-def lift_boxes(views: RoomViews) -> LiftedBoxes:
+def lift_boxes(views: RoomViews, planes: Float[np.ndarray, "planes 4"]) -> LiftedBoxes:
     """3D boxes of a room's objects, from instance ids and cameras; no 3D ground truth is used.
 
     An object's visual hull is carved coarse to fine. On each grid, the sides of the box are moved
     inwards one after another, as long as every ray through one of the object's pixels still meets
     a cell of the hull inside the box. The next grid spans only this box, which drops the parts of
-    the hull that no ray needs. `views` is a room, read with its images.
+    the hull that no ray needs. At last, hidden sides are moved to the room's `planes`
+    (`hidden_sides.py`). `views` is a room, read with its images.
     """
     rng = np.random.default_rng(0)
-    found = [_lift(Sightings.of(views, item), rng) for item in range(len(views.object_class))]
-    sides_m = np.array([sides for *sides, _ in found]).reshape(-1, 2, 3)
-    explained = np.array([share for *_, share in found])
+    count = len(views.object_class)
+    sides_m, explained = np.zeros((count, 2, 3)), np.zeros(count)
+    for item in range(count):
+        seen = Sightings.of(views, item)
+        *found, explained[item] = _lift(seen, rng)
+        known = explained[item] > 0
+        sides_m[item] = moved_to_planes(seen, np.array(found), planes) if known else found
     return LiftedBoxes(sides_m.mean(axis=1), sides_m[:, 1] - sides_m[:, 0], explained)
 
 

@@ -28,11 +28,11 @@ from sceneprior.core.observations import RoomViews
 from sceneprior.core.parts import Parts, filled_cells
 from sceneprior.core.shards import Shard, iterate_rooms
 from sceneprior.core.views import Batch
-from sceneprior.core.wall_lines import Wall, find_walls
+from sceneprior.core.wall_lines import Wall, find_ceiling, find_walls
 from sceneprior.lifted.lifting import HANGS_M, LiftedBoxes, RayPool, ShapeGrid
 from sceneprior.lifted.prototypes import Prototypes, choose_prototypes, turn_posed
 
-VERSION = 5
+VERSION = 6
 """Version of the cached boxes, hulls, rays and walls. Increase a version when results change."""
 PARTS_VERSION = 1
 """Version of the cached parts: increase it when `prototype_fitting.py`, `part_fit.py` and what it
@@ -238,16 +238,22 @@ def _lift_rooms(
     """The fields of `LiftedBoxes` and of a `RayPool` of all objects of a split, their visual hulls
     (`bits`, eight cells per byte), and the rooms' walls, from the `chosen` views of each room."""
     from sceneprior.lifted.lifting.boxes import draw_rays, lift_boxes
+    from sceneprior.lifted.lifting.hidden_sides import planes_of
     from sceneprior.lifted.lifting.hulls import lift_shapes
 
     found = []
     progress = track(chosen, "lifting objects from masks (rooms)", console=Console(stderr=True))
     for views, (shard, room_id) in zip(progress, iterate_rooms(folder, split), strict=True):
         room = shard.read_room(room_id, images=True)
-        walls = find_walls(room, views)[0] if shard.has_stuff(room_id) else ()
+        has_stuff = shard.has_stuff(room_id)
+        walls = find_walls(room, views)[0] if has_stuff else ()
+        ceiling_m = find_ceiling(room, walls, views) if has_stuff else None
+        # Half of the views suffice, and take half the time.
+        tops = () if ceiling_m is None else find_walls(room, views[::2], ceiling_m)[0]
+        planes = planes_of([*walls, *tops], ceiling_m)
         allowed = np.isin(np.arange(len(room.visible)), views)
         room = replace(room, visible=room.visible & allowed[:, None])
-        boxes = lift_boxes(room)
+        boxes = lift_boxes(room, planes)
         hulls = lift_shapes(room, boxes, shape).reshape(-1, shape.cells**3)
         rays = draw_rays(room, boxes, RAYS_KEPT, shape.margin)
         half = {name: getattr(rays, name).astype(np.float16) for name in ("starts", "spans")}

@@ -14,9 +14,11 @@ from sceneprior.lifted.lifting.boxes import (
     pass_through,
     smallest_box,
 )
+from sceneprior.lifted.lifting.hidden_sides import planes_of
 from sceneprior.lifted.lifting.hulls import MOST_EMPTY, NEVER, Sightings, carve, lift_shapes
 
 MARGIN = 1.2
+FLOOR = planes_of([], None)
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +81,7 @@ def test_boxes_are_those_of_the_room(rooms):
     of the mean size at the right place has 0.25."""
     found = []
     for views, truth in rooms:
-        boxes, count = lift_boxes(views), len(views.object_class)
+        boxes, count = lift_boxes(views, FLOOR), len(views.object_class)
         true = truth.centers_m[:count].astype(float), truth.sizes_m[:count].astype(float)
         known = boxes.explained > 0
         assert known.tolist() == (views.visible.sum(axis=0) > 1).tolist()
@@ -92,11 +94,11 @@ def test_what_few_views_show_has_a_defined_box(rooms):
     views, _ = rooms[0]
     nowhere = views.visible.copy()
     nowhere[:, 0] = False
-    boxes = lift_boxes(replace(views, visible=nowhere))
+    boxes = lift_boxes(replace(views, visible=nowhere), FLOOR)
     assert boxes.explained[0] == 0 and boxes.explained[1] > 0
     once = nowhere.copy()
     once[np.flatnonzero(views.visible[:, 0])[0], 0] = True
-    boxes = lift_boxes(replace(views, visible=once))
+    boxes = lift_boxes(replace(views, visible=once), FLOOR)
     assert boxes.explained[0] == 0, "one view does not tell how far away it is"
     assert np.isfinite(boxes.centers_m).all() and (boxes.sizes_m > 0).all()
 
@@ -139,12 +141,12 @@ def test_void_furniture_is_unknown_and_changes_no_box_and_no_hull_of_others(room
         **{name: getattr(views, name)[:, :-1] for name in
            ("boxes", "visible", "sides_clear", "mask_pixels")},
     )  # fmt: skip
-    boxes = lift_boxes(void)
-    for here, there in zip(boxes, lift_boxes(views), strict=True):
+    boxes = lift_boxes(void, FLOOR)
+    for here, there in zip(boxes, lift_boxes(views, FLOOR), strict=True):
         np.testing.assert_array_equal(here, there[:-1])
     grid = ShapeGrid(cells=12, margin=MARGIN)
     np.testing.assert_array_equal(
-        lift_shapes(void, boxes, grid), lift_shapes(views, lift_boxes(views), grid)[:-1]
+        lift_shapes(void, boxes, grid), lift_shapes(views, lift_boxes(views, FLOOR), grid)[:-1]
     )
     pool = draw_rays(void, boxes, 300, MARGIN)
     for item in np.flatnonzero(boxes.explained > 0):

@@ -81,7 +81,7 @@ def test_boxes_are_found_once_and_again_when_views_change(shards, monkeypatch):
     first = LiftedDataset(shards, "train", GRID)
     calls = []
     find = boxes.lift_boxes
-    monkeypatch.setattr(boxes, "lift_boxes", lambda room: calls.append(1) or find(room))
+    monkeypatch.setattr(boxes, "lift_boxes", lambda *room: calls.append(1) or find(*room))
     second = LiftedDataset(shards, "train", GRID)
     assert calls == []
     for one, other in zip(
