@@ -1,5 +1,7 @@
 """Samples the furniture of a living room and the rules that place it."""
 
+from math import inf
+
 import numpy as np
 import shapely
 
@@ -80,7 +82,8 @@ def _dining(room: Furnisher, group: str) -> bool:
     """Place "dining 6", a table with six chairs, near the middle of the floor beside the lounge."""
     layout, rng = room.layout, room.rng
     count = int(group.split(" ")[1])
-    tables = room.models("table", above=1.5 if count > 4 else 1.0)
+    above, below = (1.5, inf) if count > 4 else (1.0, 2.0)
+    tables = room.models("table", below, above)
     chairs = room.smallest("chair", 5, "Dining")
     (x0, x1), (z0, z1) = _beside_lounge(room)
     lounge = shapely.union_all([shapely.box(*piece.rect) for piece in layout.pieces])
