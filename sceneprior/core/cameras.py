@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
+from sceneprior.core.repeatable import constants
+
 if TYPE_CHECKING:
     from torch import Tensor
 else:
@@ -100,7 +102,7 @@ def pixel_rays(
     intrinsics: Float[Array, "*views 3 3"],
 ) -> Float[Array, "*views points 3"]:
     """Ray directions in the world (not normalised) from each camera through pixels u, v."""
-    focal = intrinsics[..., (0, 1), (0, 1)][..., None, :]
+    focal = intrinsics.reshape(*intrinsics.shape[:-2], 9)[..., None, 0:5:4]  # the diagonal
     centre = intrinsics[..., :2, 2][..., None, :]
     on_plane = (pixels - centre) / focal
     if isinstance(on_plane, np.ndarray):
@@ -201,7 +203,7 @@ def boxes_of_points(
     sides = torch.stack([ends[..., k, k % 2] for k in range(4)], dim=-1).unflatten(
         0, (rooms, views)
     )
-    boxes = sides / sides.new_tensor([width, height, width, height])
+    boxes = sides / constants(sides, width, height, width, height)
     meets_image = ((boxes[..., :2] < 1) & (boxes[..., 2:] > 0)).all(dim=-1)
     return Boxes2D(boxes.clamp(0, 1), in_front & meets_image)
 

@@ -10,6 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from sceneprior.core.boxes import CUBE_CORNERS
 from sceneprior.core.cameras import MIN_DEPTH_M, Boxes2D
+from sceneprior.core.repeatable import constants
 
 
 def icosphere(level: int) -> tuple[Float[Tensor, "vertices 3"], Int[Tensor, "faces 3"]]:
@@ -33,7 +34,7 @@ def beveled_cube(bevels: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 32 
     [0, 1]: (0, 0) is the cube, (1, 0) a prism over a diamond, and (1, 1) an octahedron.
     """
     upright, level = (1 - bevels).unsqueeze(-2).unbind(dim=-1)
-    x, y, z = bevels.new_tensor(CUBE_CORNERS).unbind(dim=-1)
+    x, y, z = constants(bevels, *CUBE_CORNERS.flat).view(-1, 3).unbind(dim=-1)
     rings = []
     for across, along in ((x, upright * z), (upright * x, z)):
         across, along = torch.broadcast_tensors(across, along)
@@ -102,7 +103,7 @@ def boxes_of_ellipsoids(
     """
     height, width = image_size
     # Image coordinates are scaled to order 1, so that their squares stay within float32.
-    scale = intrinsics.new_tensor([1 / width, 1 / height, 1.0]).unsqueeze(-1)
+    scale = constants(intrinsics, 1 / width, 1 / height, 1.0).unsqueeze(-1)
     rows = scale * (intrinsics @ world_to_camera[..., :3, :3])
     offset = (scale * (intrinsics @ world_to_camera[..., :3, 3:]))[..., 0]
     per_room = 12 * rows.shape[1] * max(centers_m.shape[1], 1)
@@ -185,7 +186,7 @@ def _find_sides(
         spread: X', Y' and Z', three numbers each: the point of w is at middle + spread @ w.
     """
     tiny = 1e-30  # its square underflows to 0; dividing by anything larger is safe in float32
-    sign = middle.new_tensor([-1.0, 1.0]).reshape(2, 1, 1, 1, 1)
+    sign = constants(middle, -1.0, 1.0).reshape(2, 1, 1, 1, 1)
     z0, dz = middle[2], spread[2]
     reach_sq = (dz * dz).sum(dim=0)
     reach = reach_sq.sqrt()

@@ -1,9 +1,16 @@
-"""Repeatable results: the range of seeds, and torch on one thread."""
+"""Repeatable results: the range of seeds, and torch on one thread; and constants on a device."""
 
 import contextlib
 from collections.abc import Iterator
+from functools import cache
+from typing import TYPE_CHECKING, Any
 
 from sceneprior.core.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+else:
+    Tensor = Any
 
 LARGEST_SEED = 2**32 - 1
 """Largest seed that NumPy, PyTorch, scikit-learn and Lightning all accept."""
@@ -29,3 +36,20 @@ def single_threaded() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
+
+
+def constants(like: Tensor, *values: float | int) -> Tensor:
+    """The values as a tensor of the type and device of `like`, which must not be modified.
+
+    It is copied to the device once. `like.new_tensor` copies it every time, for which a GPU is
+    waited for, and cannot be used in CUDA graphs.
+    """
+    return _constants(values, like.dtype, like.device)
+
+
+@cache
+def _constants(values: tuple[float | int, ...], dtype: Any, device: Any) -> Tensor:
+    import torch
+
+    with torch.inference_mode(False):  # gradients may pass through it later
+        return torch.tensor(values, dtype=dtype, device=device)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import TypeVar
@@ -10,11 +11,13 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Int, Int64, Integer
 from torch import Tensor
+from torch.nn import functional as F
 from torch.nn.utils.rnn import pad_sequence
 
 from sceneprior.core.cameras import camera_centers
 from sceneprior.core.errors import InputError
 from sceneprior.core.observations import RoomViews, thinned
+from sceneprior.core.repeatable import constants
 from sceneprior.core.shards import iterate_rooms, splits_of
 
 _B = TypeVar("_B", bound="Batch")
@@ -45,7 +48,8 @@ class SceneViews(Batch):
     """
 
     room_index: Int[Tensor, " rooms"]
-    """Row of each room in the data set, which is also the row of its latent vector."""
+    """Row of each room in the data set, which is also the row of its latent vector; -1 for rooms
+    that `padded` adds."""
     object_class: Int[Tensor, "rooms objects"]
     """Index into the label set; 0 where `is_object` is false."""
     is_object: Bool[Tensor, "rooms objects"]
@@ -65,6 +69,66 @@ class SceneViews(Batch):
     n objects. None except in the shape stage."""
     room_ids: tuple[str, ...] = ()
 
+    @cached_property
+    def object_counts(self) -> list[int]:
+        """Number of tracked objects of each room."""
+        return self.is_object.sum(dim=-1).tolist()
+
+    @cached_property
+    def object_places(self) -> tuple[Int[Tensor, " all"], Int[Tensor, " all"]]:
+        """Indices (room, object) of all tracked objects."""
+        room, item = self.is_object.nonzero(as_tuple=True)
+        return room, item
+
+    @cached_property
+    def seen_places(self) -> tuple[Int[Tensor, " all"], Int[Tensor, " all"], Int[Tensor, " all"]]:
+        """Indices (room, view, object) of all objects in the views in which they are visible."""
+        seen = self.visible & self.is_object.unsqueeze(1)
+        room, view, item = seen.nonzero(as_tuple=True)
+        return room, view, item
+
+    def to(self, device: torch.device | str) -> "SceneViews":
+        """Copy of the batch on `device`, with the counts and places that are known already.
+
+        A GPU waits for these copies, but the program does not; it would wait for a GPU to count.
+        """
+        device = torch.device(device)
+
+        def moved(tensor: Tensor) -> Tensor:
+            if device.type == "cuda" and tensor.device.type == "cpu":
+                return tensor.pin_memory().to(device, non_blocking=True)
+            return tensor.to(device)
+
+        views, known = self.changed(moved), self.__dict__
+        for name in ("object_places", "seen_places"):
+            if name in known:
+                views.__dict__[name] = tuple(map(moved, known[name]))
+        if "object_counts" in known:
+            views.__dict__["object_counts"] = known["object_counts"]
+        return views
+
+    def padded(self, rooms: int, objects: int) -> "SceneViews":
+        """The batch with this number of rooms, and of objects per room.
+
+        Rooms that are added have the views of the first room, without objects.
+        """
+        more_rooms, more = rooms - len(self.room_index), objects - self.is_object.shape[1]
+
+        def filled(tensor: Tensor) -> Tensor:
+            if not more_rooms:
+                return tensor
+            return torch.cat([tensor, tensor[:1].expand(more_rooms, *tensor.shape[1:])])
+
+        return replace(
+            self.changed(filled),
+            room_index=F.pad(self.room_index, (0, more_rooms), value=-1),
+            object_class=F.pad(self.object_class, (0, more, 0, more_rooms)),
+            is_object=F.pad(self.is_object, (0, more, 0, more_rooms)),
+            boxes=F.pad(self.boxes, (0, 0, 0, more, 0, 0, 0, more_rooms)),
+            visible=F.pad(self.visible, (0, more, 0, 0, 0, more_rooms)),
+            sides_clear=F.pad(self.sides_clear, (0, 0, 0, more, 0, 0, 0, more_rooms)),
+        )
+
     @property
     def observed_ids(self) -> Integer[Tensor, "rooms views height width"]:
         """Instance-id images, for callers that need them."""
@@ -83,7 +147,7 @@ class SceneViews(Batch):
     ) -> Float[Tensor, "rooms views 3 3"]:
         """Intrinsics in pixels of images of another size."""
         full_height, full_width = self.image_size
-        scale = self.intrinsics.new_tensor([width / full_width, height / full_height, 1])
+        scale = constants(self.intrinsics, width / full_width, height / full_height, 1)
         return self.intrinsics * scale[:, None]
 
 

@@ -35,7 +35,7 @@ from sceneprior.lifted.prototypes import (
     turned_extents,
 )
 from sceneprior.lifted.shape_morphing import appearances_of, blend_parts, matched_parts
-from sceneprior.paper.decoders import ShapeModule, ShapeModuleConfig
+from sceneprior.paper.decoders import Places, ShapeModule, ShapeModuleConfig
 
 KEPT = 512
 """Number of looks, and of matched pairs of looks, that are kept for later rooms: about 6 MB."""
@@ -196,7 +196,7 @@ class PrototypeDecoder(ShapeModule):
         self,
         scenes: DecodedScenes,
         features: Float[Tensor, "rooms objects features"],
-        with_shape: bool | Bool[Tensor, "rooms shaped"],
+        with_shape: bool | Places,
         wanted: Bool[Tensor, "rooms wanted"] | None,
     ) -> DecodedScenes:
         """The scenes with shape codes of all objects and, with `with_shape`, the looks nearest to

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -17,6 +17,8 @@ from sceneprior.core.scene import Mesh, Solid
 from sceneprior.core.settings import Section
 from sceneprior.core.views import DecodedScenes
 
+Places = tuple[Int[Tensor, " places"], Int[Tensor, " places"]]
+"""Rooms and numbers of predictions, as indices."""
 INITIAL_SIZE_M = 0.7
 """Edge of every box before training."""
 
@@ -188,7 +190,7 @@ class ShapeModule(nn.Module, ABC):
         self,
         scenes: DecodedScenes,
         features: Float[Tensor, "rooms objects features"],
-        with_shape: bool | Bool[Tensor, "rooms shaped"],
+        with_shape: bool | Places,
         wanted: Bool[Tensor, "rooms wanted"] | None,
     ) -> DecodedScenes:
         """The decoded layouts with shapes added; the arguments are those of `ScenePrior.decode`."""
@@ -289,7 +291,7 @@ class ShapeDecoder(ShapeModule):
         self,
         scenes: DecodedScenes,
         features: Float[Tensor, "rooms objects features"],
-        with_shape: bool | Bool[Tensor, "rooms shaped"],
+        with_shape: bool | Places,
         wanted: Bool[Tensor, "rooms wanted"] | None,
     ) -> DecodedScenes:
         """Add the objects' meshes, placed in their boxes; vertices of objects without a mesh lie at
@@ -301,11 +303,10 @@ class ShapeDecoder(ShapeModule):
         if shaped is None:
             shapes = self(features).to(dtype)
         else:
-            assert isinstance(shaped, Tensor)
-            shaped = F.pad(shaped, (0, features.shape[1] - shaped.shape[1]))
-            some = self(features[shaped].unsqueeze(0))[0].to(dtype)
-            shapes = some.new_zeros(*shaped.shape, *some.shape[1:])
-            shapes = shapes.index_put((shaped,), some)
+            assert not isinstance(shaped, bool)
+            at = shaped if isinstance(shaped, tuple) else shaped.nonzero(as_tuple=True)
+            some = self(features[at].unsqueeze(0))[0].to(dtype)
+            shapes = some.new_zeros(*features.shape[:2], *some.shape[1:]).index_put(at, some)
         return replace(scenes, vertices_m=place(shapes, scenes.centers_m, scenes.sizes_m))
 
     def mesh_of(self, decoded: DecodedScenes, room: int, item: int) -> Mesh | None:

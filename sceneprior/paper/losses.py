@@ -15,6 +15,7 @@ from torch import distributed as dist
 from torch.nn import functional as F
 
 from sceneprior.core.cameras import Boxes2D, camera_centers, pixel_rays
+from sceneprior.core.repeatable import constants
 from sceneprior.core.views import DecodedScenes, SceneViews
 from sceneprior.paper.matching import Matches, first_predictions, match_objects, side_distance
 from sceneprior.paper.settings import LossConfig, ShapeConfig
@@ -52,8 +53,22 @@ def layout_losses(
         FloatingPointError: the weighted sum is not finite. This is checked before anything is
             rendered, since the renderer's own error for vertices that are not finite names no room.
     """
+    matches = match_objects(scenes, boxes_2d, views, weights.match_box, weights.occlusion_slack)
+    losses = matched_losses(scenes, boxes_2d, views, matches, weights, completeness_target)
+    check_finite(weighted_sum(losses, weights).detach().sum(), views.room_ids)
+    return losses, matches
+
+
+def matched_losses(
+    scenes: DecodedScenes,
+    boxes_2d: Boxes2D,
+    views: SceneViews,
+    matches: Matches,
+    weights: LossConfig,
+    completeness_target: str | None,
+) -> dict[str, Float[Tensor, "*rooms"]]:
+    """The terms of `layout_losses`, which documents the arguments, without its check."""
     slack, per_room = weights.occlusion_slack, completeness_target is None
-    matches = match_objects(scenes, boxes_2d, views, weights.match_box, slack)
     predicted = take(boxes_2d.boxes, matches.prediction, dim=2)
     inside = take(boxes_2d.in_frustum, matches.prediction, dim=2)
     centers = take(scenes.centers_m, matches.prediction, dim=1)
@@ -66,8 +81,7 @@ def layout_losses(
     if completeness_target is not None:
         losses["completeness"] = completeness_loss(scenes, views, completeness_target)
     losses["frustum"] = frustum_loss(centers, views, seen & ~inside, per_room)
-    check_finite(weighted_sum(losses, weights).detach().sum(), views.room_ids)
-    return losses, matches
+    return losses
 
 
 def class_loss(
@@ -105,7 +119,9 @@ def completeness_loss(scenes: DecodedScenes, views: SceneViews, target: str) -> 
     logits = scenes.completeness_logits
     wanted = completeness_targets(views.is_object.sum(dim=-1), logits.shape[1], target)
     wanted = wanted.to(logits.dtype)
-    mean = F.binary_cross_entropy_with_logits(logits, wanted)
+    # Rooms that `SceneViews.padded` adds do not count.
+    real = (views.room_index >= 0).to(logits.dtype).unsqueeze(1)
+    mean = F.binary_cross_entropy_with_logits(logits, wanted, real / real.mean())
     return mean * share_of_batch(views.is_object.any(dim=-1).sum())
 
 
@@ -123,7 +139,7 @@ def frustum_loss(
     other views do not count (supplement B).
     """
     height, width = views.image_size
-    size = views.boxes.new_tensor([width, height])
+    size = constants(views.boxes, width, height)
     middle = (views.boxes[..., :2] + views.boxes[..., 2:]) / 2 * size
     target = pixel_rays(middle, views.world_to_camera, views.intrinsics)
     ray = centers_m.unsqueeze(1) - camera_centers(views.world_to_camera).unsqueeze(2)
@@ -191,8 +207,7 @@ def mask_loss(
         The loss, and, for logging, `mask_iou` (mean over all visible pairs) and `mask_used` (share
         of pairs that pass the gate); with `per_room`, one of each per room.
     """
-    seen = views.visible & matches.valid.unsqueeze(1)
-    room, view, item = seen.nonzero(as_tuple=True)
+    room, view, item = views.seen_places
     prediction = matches.prediction[room, item]
     known = views.known_pixels[room, view].to(rendered.dtype)
     mine = rendered[room, view, prediction] * known
@@ -202,7 +217,7 @@ def mask_loss(
     # For a wrong pixel that rounds to 0 or 1, torch's gradient of the logarithm would be 1e12.
     certain = mine.clamp(CERTAIN, 1 - CERTAIN)
     each = F.binary_cross_entropy(certain, observed, known, reduction="none").mean(dim=(1, 2))
-    count = seen.sum(dim=1)
+    count = (views.visible & matches.valid.unsqueeze(1)).sum(dim=1)
     share = 1 / count[room, item].to(mine.dtype)
     per_object = mine.new_zeros(count.shape)
     per_object = per_object.index_put((room, item), each * use * share, accumulate=True)

@@ -29,27 +29,38 @@ def seen_boxes(
     In a room with n tracked objects, only the first n predictions, which are matched, get a box;
     the others get empty boxes, and count as outside the frustum.
     """
-    project: Callable[..., Boxes2D] = boxes_of_points
-    boxes_m = (scenes.centers_m, scenes.sizes_m)
-    if scenes.vertices_m is not None and box_from == "mesh":
-        shapes: tuple[Tensor, ...] = (scenes.vertices_m,)
-    elif proxy == "ellipsoid":
-        project, shapes = boxes_of_ellipsoids, boxes_m
-    else:
-        assert scenes.bevels is not None, "decode() gives every object bevels"
-        shapes = (place(beveled_cube(scenes.bevels), *boxes_m),)
+    project, shapes = _solids(scenes, proxy, box_from)
     rooms, slots = scenes.centers_m.shape[:2]
-    first = first_predictions(views, slots)
-    room = first.nonzero()[:, 0]
+    first = views.object_places
+    cameras = (views.world_to_camera[first[0]], views.intrinsics[first[0]], views.image_size)
     # Each prediction is projected as a room with a single object.
-    cameras = (views.world_to_camera[room], views.intrinsics[room], views.image_size)
     found = project(*(values[first].unsqueeze(1) for values in shapes), *cameras)
     return Boxes2D(*(
         of.new_zeros(rooms, slots, *of.shape[1:2], *of.shape[3:])
-        .index_put((first,), of[:, :, 0])
+        .index_put(first, of[:, :, 0])
         .transpose(1, 2)
         for of in found
     ))  # fmt: skip
+
+
+def proxy_boxes(scenes: DecodedScenes, views: SceneViews, proxy: str) -> Boxes2D:
+    """2D boxes of all predictions, computed from the shapes that `StageConfig.proxy` names. They
+    have the same shape in every batch (`seen_boxes` saves work)."""
+    project, shapes = _solids(scenes, proxy, "proxy")
+    return project(*shapes, views.world_to_camera, views.intrinsics, views.image_size)
+
+
+def _solids(
+    scenes: DecodedScenes, proxy: str, box_from: str
+) -> tuple[Callable[..., Boxes2D], tuple[Tensor, ...]]:
+    """The function that projects objects to their 2D boxes, and its first arguments."""
+    boxes_m = (scenes.centers_m, scenes.sizes_m)
+    if scenes.vertices_m is not None and box_from == "mesh":
+        return boxes_of_points, (scenes.vertices_m,)
+    if proxy == "ellipsoid":
+        return boxes_of_ellipsoids, boxes_m
+    assert scenes.bevels is not None, "decode() gives every object bevels"
+    return boxes_of_points, (place(beveled_cube(scenes.bevels), *boxes_m),)
 
 
 class Matches(NamedTuple):
@@ -81,14 +92,18 @@ def match_objects(
     `side_distance`.
     """
     cost = matching_cost(scenes, boxes_2d, views, box_weight, occlusion_slack)
-    counts = views.is_object.sum(dim=-1)
-    if (most := int(counts.max())) > cost.shape[1]:
+    counts = views.object_counts
+    if (most := max(counts)) > cost.shape[1]:
         raise ValueError(
             f"A room holds {most} tracked objects but the prior generates {cost.shape[1]}; set "
             f"model.max_objects to at least {most}."
         )
-    prediction = assign(cost, counts.tolist(), counts.tolist())
-    return Matches(prediction, views.is_object & views.visible.any(dim=1))
+    return Matches(assign(cost, counts, counts), matchable(views))
+
+
+def matchable(views: SceneViews) -> Bool[Tensor, "rooms objects"]:
+    """`Matches.valid` of a batch."""
+    return views.is_object & views.visible.any(dim=1)
 
 
 def assign(

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -17,7 +17,13 @@ from sceneprior.core.dataset import ViewDataset
 from sceneprior.core.errors import InputError
 from sceneprior.core.settings import Section
 from sceneprior.core.views import DecodedScenes
-from sceneprior.paper.decoders import ClassBevels, LayoutDecoder, ShapeModule, ShapeModuleConfig
+from sceneprior.paper.decoders import (
+    ClassBevels,
+    LayoutDecoder,
+    Places,
+    ShapeModule,
+    ShapeModuleConfig,
+)
 from sceneprior.paper.transformer import DecoderConfig
 from sceneprior.training.method import RunConfig, ready_copy
 
@@ -212,28 +218,38 @@ class ScenePrior(nn.Module):
     def decode(
         self,
         z: Float[Tensor, "rooms width"],
-        with_shape: bool | Bool[Tensor, "rooms shaped"] = True,
+        with_shape: bool | Places = True,
         wanted: Bool[Tensor, "rooms wanted"] | None = None,
     ) -> DecodedScenes:
         """Decode rooms from points of the latent space; `with_shape` adds shapes.
 
-        If `with_shape` is a tensor, it selects the objects that get a mesh; all vertices of the
-        other objects lie at the centre of their box. `wanted` limits what is decoded: as many
+        If `with_shape` is not a bool, it holds the indices (room, object) of the objects that get a
+        mesh; all vertices of the others lie at the centre of their box. `wanted` limits what is decoded: as many
         predictions as it has columns, and meshes only where it is true. Predictions after a room's
         last true entry are meaningless. None decodes all N.
-
-        Layouts stay float32 under autocast: bfloat16 would round 3 m to steps of 2 cm.
         """
         count = self.max_objects if wanted is None else wanted.shape[1]
         needed = None
         if wanted is not None:
             numbers = torch.arange(1, wanted.shape[1] + 1, device=wanted.device)
             needed = (wanted * numbers).amax(dim=1)
-        features = self.decoder(z, count, needed)
+        scenes, shared = self.layouts(z, count, needed)
+        return self.shape.add_shapes(scenes, shared, with_shape, wanted)
+
+    def layouts(
+        self,
+        z: Float[Tensor, "rooms width"],
+        objects: int,
+        needed: Int[Tensor, " rooms"] | None = None,
+    ) -> tuple[DecodedScenes, Float[Tensor, "rooms objects features"]]:
+        """Decode rooms without shapes, and the features from which shapes are decoded.
+
+        Layouts stay float32 under autocast: bfloat16 would round 3 m to steps of 2 cm.
+        """
+        features = self.decoder(z, objects, needed)
         with torch.autocast(z.device.type, enabled=False):
             scenes, shared = self.layout(features.to(z.dtype))
-        scenes = replace(scenes, bevels=self.bevels(scenes.class_logits))
-        return self.shape.add_shapes(scenes, shared, with_shape, wanted)
+        return replace(scenes, bevels=self.bevels(scenes.class_logits)), shared
 
 
 class PriorConfig(RunConfig):

@@ -77,6 +77,10 @@ class StageConfig(LatentStageConfig):
     in training from views and when rooms are fitted to images. `ellipsoid`: the ellipsoid inscribed
     in the 3D box, in closed form. `beveled_box`: the 3D box with its edges cut off by the learnt
     bevels of the class."""
+    cuda_graphs: bool = True
+    """On a single GPU, launch what has the same shape in every batch as CUDA graphs (`StaticStep`),
+    without a gradient averaged over batches. Then a loss that is not finite is found one step
+    later. It changes the last bits of sums, and nothing on a CPU."""
 
 
 class LayoutConfig(StageConfig):

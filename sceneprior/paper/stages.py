@@ -1,5 +1,6 @@
 """The paper's two stages: layouts from 2D boxes (Eq. 7), then shapes from masks as well (Eq. 8)."""
 
+import warnings
 from abc import ABC, abstractmethod
 from typing import Any
 
@@ -9,7 +10,8 @@ from jaxtyping import Float, Int
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
 
-from sceneprior.core.views import SceneViews
+from sceneprior.core.errors import InputWarning
+from sceneprior.core.views import DecodedScenes, SceneViews
 from sceneprior.paper.losses import layout_losses, mask_loss, seen_masks
 from sceneprior.paper.matching import seen_boxes
 from sceneprior.paper.prior import ScenePrior
@@ -21,6 +23,8 @@ from sceneprior.paper.settings import (
     StageConfig,
     Steps,
 )
+from sceneprior.paper.static_step import StaticStep
+from sceneprior.training.graphs import OnHost
 from sceneprior.training.steps import (
     batch_seed,
     check_finite,
@@ -64,7 +68,7 @@ class LatentStage(lightning.LightningModule, ABC):
         done = self.current_epoch / stage.epochs
         noise = stage.latent_noise + done * (end - stage.latent_noise)
         with full_precision(self.device):
-            z = space(self.latents(room_index))
+            z = space(self.latents(room_index.clamp(min=0)))
             if not noise:
                 return z
             return space.step(z, noise, batch_seed(self.seed, self.trainer, batch_idx))
@@ -96,13 +100,79 @@ class LatentStage(lightning.LightningModule, ABC):
         return with_cosine(optimizer, int(self.trainer.estimated_stepping_batches))
 
 
-class LayoutStage(LatentStage):
+class PaperStage(LatentStage):
+    """A stage of the paper, whose step may have static shapes on a GPU.
+
+    Such a step waits for the GPU once, and its loss is checked when the next step begins.
+    """
+
+    stage: StageConfig
+    loss: LossConfig
+    static: StaticStep | None = None
+    _unchecked: tuple[OnHost, tuple[str, ...]] | None = None
+
+    def use_graphs(self, trainer: lightning.Trainer) -> bool:
+        """Use CUDA graphs if the settings and the trainer allow; says why not on a GPU."""
+        on_gpu = trainer.strategy.root_device.type == "cuda"
+        if not (on_gpu and self.stage.cuda_graphs):
+            return False
+        if trainer.world_size > 1 or self.stage.accumulate > 1:
+            cause = "several processes train together"
+            if trainer.world_size == 1:
+                cause = "gradients of several batches are averaged"
+            warnings.warn(
+                f"{cause[0].upper()}{cause[1:]}, so steps are not captured as CUDA graphs.",
+                InputWarning,
+                stacklevel=2,
+            )
+            return False
+        self.static = StaticStep(self.prior, self.stage, self.loss, self.completeness_target)
+        return True
+
+    def on_before_batch_transfer(self, batch: SceneViews, dataloader_idx: int) -> SceneViews:
+        return batch if self.static is None else self.static.padded(batch)
+
+    def training_step(self, views: SceneViews, batch_idx: int) -> Tensor:
+        if self.static is None:
+            return self.eager_step(views, batch_idx)
+        self._check_last()
+        z = self.room_latents(views.room_index, batch_idx)
+        self.static.prepare(z, views)
+        total = self.static_step(self.static, z, views)
+        self._unchecked = OnHost(total), views.room_ids
+        if self.trainer.is_last_batch:  # before the epoch's checkpoint
+            self._check_last()
+        return total
+
+    def _check_last(self) -> None:
+        if self._unchecked is not None:
+            total, room_ids = self._unchecked
+            self._unchecked = None
+            check_finite(total.read()[0], room_ids)
+
+    @abstractmethod
+    def eager_step(self, views: SceneViews, batch_idx: int) -> Tensor:
+        """The loss of a batch."""
+
+    @abstractmethod
+    def static_step(self, static: StaticStep, z: Tensor, views: SceneViews) -> Tensor:
+        """The loss of a padded batch with the latents z."""
+
+
+class LayoutStage(PaperStage):
     """Trains with the layout loss L_L, without decoding shapes (section 3.4, Eq. 7)."""
 
     stage: LayoutConfig
-    loss: LossConfig
 
-    def training_step(self, views: SceneViews, batch_idx: int) -> Tensor:
+    def static_step(self, static: StaticStep, z: Tensor, views: SceneViews) -> Tensor:
+        scenes, _ = static.layouts(z)
+        with full_precision(self.device):
+            boxes = static.boxes(scenes, views)
+            matches = static.matches(static.cost(scenes, boxes, views), views)
+            losses = static.losses(scenes, boxes, views, matches)
+            return self.total(losses, len(views.room_ids))
+
+    def eager_step(self, views: SceneViews, batch_idx: int) -> Tensor:
         scenes = self.prior.decode(self.room_latents(views.room_index, batch_idx), False)
         with full_precision(self.device):
             boxes = seen_boxes(scenes, views, self.stage.proxy)
@@ -110,24 +180,38 @@ class LayoutStage(LatentStage):
             return self.total(losses, len(views.room_index))
 
 
-class ShapeStage(LatentStage):
+class ShapeStage(PaperStage):
     """Trains with the layout loss of deformed meshes and the mask loss: L = L_L + lambda_S L_S."""
 
     stage: ShapeConfig
-    loss: LossConfig
 
-    def training_step(self, views: SceneViews, batch_idx: int) -> Tensor:
+    def static_step(self, static: StaticStep, z: Tensor, views: SceneViews) -> Tensor:
+        scenes, shared = static.layouts(z)
+        scenes = self.prior.shape.add_shapes(scenes, shared, views.object_places, None)
+        with full_precision(self.device):
+            boxes = static.boxes(scenes, views, self.stage.box_from)
+            cost = static.cost(scenes, boxes, views)
+            masks = self._masks(scenes, views)  # drawn while the host solves the assignment
+            matches = static.matches(cost, views)
+            losses = static.losses(scenes, boxes, views, matches)
+            losses["mask"], overlap = mask_loss(masks, views, matches, self.loss.iou_gate)
+            return self.total(losses, len(views.room_ids), **overlap)
+
+    def _masks(self, scenes: DecodedScenes, views: SceneViews) -> Tensor:
+        faces = self.prior.shape.faces
+        assert scenes.vertices_m is not None and faces is not None, "masks are of meshes"
+        return seen_masks(scenes.vertices_m, faces, views, self.stage)
+
+    def eager_step(self, views: SceneViews, batch_idx: int) -> Tensor:
         # In a room of n objects, only the first n predictions are matched and rendered.
         z = self.room_latents(views.room_index, batch_idx)
-        scenes = self.prior.decode(z, views.is_object)
+        scenes = self.prior.decode(z, views.object_places)
         with full_precision(self.device):
             boxes = seen_boxes(scenes, views, self.stage.proxy, self.stage.box_from)
             losses, matches = layout_losses(
                 scenes, boxes, views, self.loss, self.completeness_target
             )
-            faces = self.prior.shape.faces
-            assert scenes.vertices_m is not None and faces is not None, "masks are of meshes"
-            masks = seen_masks(scenes.vertices_m, faces, views, self.stage)
+            masks = self._masks(scenes, views)
             losses["mask"], overlap = mask_loss(masks, views, matches, self.loss.iou_gate)
             total = self.total(losses, len(views.room_index), **overlap)
             check_finite(total, views.room_ids)

@@ -164,7 +164,9 @@ def _train(
         folder.mkdir(parents=True, exist_ok=True)
         remove_parts(folder)  # left by a process killed while saving
         dump_settings(config, folder.parent / "config.yaml")
-    if rooms.masks is None:  # with masks, worker processes may load the batches
+    with_graphs = hasattr(module, "use_graphs") and module.use_graphs(trainer)
+    # With masks, worker processes may load the batches; for CUDA graphs, the host counts objects.
+    if rooms.masks is None and not with_graphs:
         rooms.to(trainer.strategy.root_device)
     loader = make_loader(
         rooms, settings.batch_size, config.seed, config.data.workers,

@@ -115,7 +115,7 @@ def test_decoded_scenes(paper, lifted):
 
 def test_losses_of_views(paper, images):
     views = as_views(images, 4)
-    scenes = paper.prior.decode(paper.prior.latent_space(paper.logits[:4]), views.is_object)
+    scenes = paper.prior.decode(paper.prior.latent_space(paper.logits[:4]), views.object_places)
     weights, stage = paper.config.loss, paper.config.shape
     boxes = seen_boxes(scenes, views, stage.proxy, stage.box_from)
     proxies = {name: seen_boxes(scenes, views, name).boxes for name in ("ellipsoid", "beveled_box")}

@@ -126,22 +126,9 @@ def render_scene(
         blur_px2 = math.log(1 / 1e-4 - 1) * sigma_px2
     if not blur_px2 >= 0:
         raise ValueError(f"blur_px2 is {blur_px2}; it must not be negative")
-    finite = torch.isfinite(vertices_m).flatten(2).all(dim=-1)
-    if not bool(finite.all()):
-        room, item = (~finite).nonzero()[0].tolist()
-        raise ValueError(f"object {item} of room {room} has a vertex that is not finite")
-    seen = torch.isfinite(world_to_camera).flatten(2).all(-1)
-    seen &= torch.isfinite(intrinsics).flatten(2).all(-1)
-    if not bool(seen.all()):
-        room, view = (~seen).nonzero()[0].tolist()
-        raise ValueError(f"view {view} of room {room} has a pose or intrinsics that is not finite")
     rooms, objects, vertices = vertices_m.shape[:3]
     views = world_to_camera.shape[1]
-    if len(faces) and not 0 <= int(faces.min()) <= int(faces.max()) < vertices:
-        raise ValueError(
-            f"faces name vertices {int(faces.min())} to {int(faces.max())}, but each object has "
-            f"vertices 0 to {vertices - 1}"
-        )
+    _check_values(vertices_m, faces, world_to_camera, intrinsics)
     if drawn is None:
         drawn = torch.ones(rooms, objects, dtype=torch.bool, device=vertices_m.device)
     if backend == "auto":
@@ -163,6 +150,28 @@ def render_scene(
     drawn = drawn.repeat_interleave(views, dim=0)
     images = engine.draw(pixels, depths, faces, drawn, settings)
     return RenderedScene(*(array.unflatten(0, (rooms, views)) for array in images))
+
+
+def _check_values(
+    vertices_m: Tensor, faces: Tensor, world_to_camera: Tensor, intrinsics: Tensor
+) -> None:
+    finite = torch.isfinite(vertices_m).flatten(2).all(dim=-1)
+    seen = torch.isfinite(world_to_camera).flatten(2).all(-1)
+    seen &= torch.isfinite(intrinsics).flatten(2).all(-1)
+    vertices = vertices_m.shape[2]
+    known = (faces >= 0) & (faces < vertices)
+    if bool(torch.stack([finite.all(), seen.all(), known.all()]).all()):  # waits for a GPU once
+        return
+    if not bool(finite.all()):
+        room, item = (~finite).nonzero()[0].tolist()
+        raise ValueError(f"object {item} of room {room} has a vertex that is not finite")
+    if not bool(seen.all()):
+        room, view = (~seen).nonzero()[0].tolist()
+        raise ValueError(f"view {view} of room {room} has a pose or intrinsics that is not finite")
+    raise ValueError(
+        f"faces name vertices {int(faces.min())} to {int(faces.max())}, but each object has "
+        f"vertices 0 to {vertices - 1}"
+    )
 
 
 Arguments = ParamSpec("Arguments")
