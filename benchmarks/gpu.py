@@ -3,6 +3,7 @@
     python benchmarks/gpu.py [--out FOLDER] [--only PART ...]
     python benchmarks/gpu.py --tiny                  # a trial of all parts, in minutes
     python benchmarks/gpu.py --tiny --device cpu
+    python benchmarks/gpu.py --brief --shards SHARDS --flat FLAT.npz    # some parts: six minutes
 
 The parts compare kernels with the reference, and silhouettes with PyTorch3D and nvdiffrast if these
 are installed. On procedural homes they train both stages of the paper's run
@@ -21,14 +22,17 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
+import gpu_graphs
 import gpu_parts
+import gpu_sphere
 import torch
-from gpu_parts import PAPER, TINY, Setup, Sizes
+from gpu_parts import BRIEF, PAPER, TINY, Setup, Sizes
 from harness import machine
 
 
@@ -43,14 +47,18 @@ class Part(NamedTuple):
 PARTS = {
     "kernels": Part(gpu_parts.kernels, 3, "Silhouette kernels against the reference"),
     "homes": Part(gpu_parts.homes, 3, "Homes to train on"),
+    "graphs": Part(gpu_graphs.graphs_part, 8, "The paper's run with CUDA graphs and without"),
     "schedule": Part(gpu_parts.schedule, 8, "The paper's run"),
     "speed": Part(gpu_parts.speed, 4, "Silhouettes"),
     "peers": Part(gpu_parts.peers, 2, "Silhouettes beside other renderers, one room"),
     "precision": Part(gpu_parts.precision, 8, "Precision"),
     "batches": Part(gpu_parts.batches, 5, "A larger batch"),
     "processes": Part(gpu_parts.processes, 7, "Two processes on one device"),
+    "sphere": Part(gpu_sphere.sphere, 10, "The released network on 3,500 and on 534 rooms"),
 }
-"""The parts in order of importance; their limits add up to 40 minutes."""
+"""The parts in order of importance; their limits add up to an hour."""
+BRIEF_MINUTES = {"kernels": 0.5, "graphs": 2.4, "sphere": 2.7}
+"""The parts of a run of six minutes, with their limits."""
 
 
 def run(parts: dict[str, Part], out: Path, words: list[str]) -> dict[str, Any]:
@@ -66,6 +74,7 @@ def run(parts: dict[str, Part], out: Path, words: list[str]) -> dict[str, Any]:
         start = time.monotonic()
         end += 60 * part.minutes  # later parts may use the time that earlier parts left
         problem = run_part(name, out, words, end - start)
+        print(f"{name}: {time.monotonic() - start:.0f} s; {problem or 'done'}", flush=True)
         rows = out / "parts" / f"{name}.jsonl"
         lines = rows.read_text().splitlines() if rows.is_file() else []
         found["parts"][name] = {
@@ -85,10 +94,16 @@ def run_part(name: str, out: Path, words: list[str], seconds: float) -> str | No
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{name}.jsonl").unlink(missing_ok=True)
     log = folder / f"{name}.log"
-    command = [sys.executable, __file__, *words, "--out", str(out), "--part", name]
+    command = [sys.executable, "-u", __file__, *words, "--out", str(out), "--part", name]
+    command += ["--until", f"{time.time() + seconds:.1f}"]
     with log.open("w") as said:
         # The child gets a new session, so that processes started by training can be killed with it.
-        child = subprocess.Popen(command, stdout=said, stderr=said, start_new_session=True)
+        child = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+            start_new_session=True,
+        )  # fmt: skip
+        repeats = threading.Thread(target=repeat, args=(child.stdout, said), daemon=True)
+        repeats.start()
         try:
             status = child.wait(seconds)
         except subprocess.TimeoutExpired:
@@ -97,21 +112,33 @@ def run_part(name: str, out: Path, words: list[str], seconds: float) -> str | No
             if child.poll() is None:
                 os.killpg(child.pid, signal.SIGKILL)
                 child.wait()
+            repeats.join(5)
     if not status:
         return None
     lines = log.read_text().strip().splitlines() or [f"exit status {status}"]
     return lines[-1]
 
 
-def measure(name: str, device: str, sizes: Sizes, out: Path) -> None:
+def repeat(lines: IO[str], said: IO[str]) -> None:
+    """Print what a part prints, and write it to its log."""
+    for line in lines:
+        print(line, end="", flush=True)
+        said.write(line)
+        said.flush()
+
+
+def measure(name: str, options: argparse.Namespace, sizes: Sizes, out: Path) -> None:
     """Measure one part, in the process of that part."""
     with (out / "parts" / f"{name}.jsonl").open("a") as file:
 
         def note(what: str, figures: dict[str, float]) -> None:
             file.write(json.dumps({"what": what, "figures": figures}) + "\n")
             file.flush()
+            values = "; ".join(f"{key} {shown(value)}" for key, value in figures.items())
+            print(f"* {what}: {values}", flush=True)
 
-        PARTS[name].measure(Setup(device, sizes, out, note))
+        given = options.shards, options.flat, options.until
+        PARTS[name].measure(Setup(options.device, sizes, out, note, *given))
 
 
 def as_markdown(found: dict[str, Any]) -> str:
@@ -165,17 +192,29 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=Path("out/gpu"))
     parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
     parser.add_argument("--tiny", action="store_true", help="small sizes, for a trial of minutes")
-    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--brief", action="store_true", help="some parts, in six minutes")
+    parser.add_argument("--only", nargs="+", choices=PARTS)
+    parser.add_argument("--shards", type=Path, help="shards to train on, instead of made homes")
+    parser.add_argument("--flat", type=Path, help="views of many rooms, for the part `sphere`")
     parser.add_argument("--part", choices=PARTS, help=argparse.SUPPRESS)
+    parser.add_argument("--until", type=float, default=0.0, help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     if options.device == "cuda" and not torch.cuda.is_available():
         parser.error("torch finds no GPU here; for a trial without one: --device cpu --tiny")
     out = options.out.absolute()
     if options.part:
-        measure(options.part, options.device, TINY if options.tiny else PAPER, out)
+        sizes = TINY if options.tiny else BRIEF if options.brief else PAPER
+        measure(options.part, options, sizes, out)
         return
-    words = ["--device", options.device, *(["--tiny"] if options.tiny else [])]
-    run({name: PARTS[name] for name in options.only}, out, words)
+    parts = dict(PARTS)
+    if options.brief:
+        parts = {name: PARTS[name]._replace(minutes=most) for name, most in BRIEF_MINUTES.items()}
+    words = ["--device", options.device]
+    words += [f"--{name}" for name in ("tiny", "brief") if getattr(options, name)]
+    for name in ("shards", "flat"):
+        if (path := getattr(options, name)) is not None:
+            words += [f"--{name}", str(path.absolute())]
+    run({name: part for name, part in parts.items() if name in (options.only or parts)}, out, words)
     print((out / "gpu.md").read_text())
 
 

@@ -55,6 +55,10 @@ class Sizes:
     epochs: int = 5
     changes: tuple[str, ...] = ()
     """Changes to the paper's config."""
+    kernels: tuple[tuple[str, str, torch.dtype], ...] = tuple(
+        product(MODES, COMPOSITING, (torch.float32, torch.float64))
+    )
+    """Mode, compositing and precision of the compared kernels."""
 
 
 PAPER = Sizes()
@@ -68,6 +72,11 @@ TINY = Sizes(
     ),
 )  # fmt: skip
 """Sizes for a test on a CPU."""
+BRIEF = Sizes(
+    kernels=(("exact", "paper", torch.float32), ("fast", "layered", torch.float32)),
+    levels=(3,), repeats=5,
+)  # fmt: skip
+"""Sizes for a few minutes of a GPU: the kernels that training uses."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +90,12 @@ class Setup:
     note: Callable[[str, dict[str, float]], None]
     """Function that immediately writes a row of the part's table, from the row's title and values
     by name; names end in units."""
+    shards: Path | None = None
+    """Shards to train on; None makes homes."""
+    flat: Path | None = None
+    """Views of thousands of rooms, for the part `sphere`."""
+    until: float = 0.0
+    """Time, as of `time.time()`, at which the part is stopped."""
 
 
 @contextmanager
@@ -100,8 +115,8 @@ SIGMA_PX2 = 0.25
 
 def kernels(setup: Setup) -> None:
     """Compare every mode, compositing and precision with the float64 reference on the device."""
-    room, dtypes = _small_room(setup), (torch.float32, torch.float64)
-    for mode, compositing, dtype in product(MODES, COMPOSITING, dtypes):
+    room = _small_room(setup)
+    for mode, compositing, dtype in setup.sizes.kernels:
         how = {"mode": mode, "compositing": compositing, "sigma_px2": SIGMA_PX2}
         rounded = room | {
             name: value.to(dtype).double() for name, value in room.items() if _is_real(value)
@@ -240,7 +255,7 @@ def schedule(setup: Setup) -> None:
     """Time a few epochs of the paper's run; extrapolate to the whole schedule."""
     whole = load_config(str(find_config(CONFIG)))
     epochs = {stage.name: stage.settings.epochs for stage in whole.stages()}
-    config = paper_run(_shards(setup), setup.sizes.epochs, *_changes(setup, setup.sizes.rooms))
+    config = paper_run(shards_of(setup), setup.sizes.epochs, *changes_of(setup, setup.sizes.rooms))
     hours: dict[str, float] = {}
 
     def ended(stage: str, times: StageTimes) -> None:
@@ -276,7 +291,7 @@ def _time(setup: Setup, what: str, bits: str, matmul: str, batch: int) -> None:
     def ended(stage: str, times: StageTimes) -> None:
         setup.note(f"{stage} stage, {what}", times.figures())
 
-    config = paper_run(_shards(setup), setup.sizes.epochs, *_changes(setup, batch))
+    config = paper_run(shards_of(setup), setup.sizes.epochs, *changes_of(setup, batch))
     options = {"accelerator": setup.device, "devices": 1, "precision": bits}
     with tempfile.TemporaryDirectory() as name:
         timed_fit(config, Path(name) / "run", options, matmul, ended=ended)
@@ -284,17 +299,19 @@ def _time(setup: Setup, what: str, bits: str, matmul: str, batch: int) -> None:
 
 def processes(setup: Setup) -> None:
     """Compare two processes, which share each batch and the device, with one."""
-    shards, sizes = _shards(setup), setup.sizes
+    shards, sizes = shards_of(setup), setup.sizes
     with tempfile.TemporaryDirectory() as name:
-        changes = _changes(setup, sizes.rooms)
+        changes = changes_of(setup, sizes.rooms)
         found = compare(shards, Path(name), setup.device, sizes.epochs, 1, changes)
     for stage, figures in found.items():
         setup.note(f"{stage} stage", figures)
 
 
-def _shards(setup: Setup) -> Path:
+def shards_of(setup: Setup) -> Path:
+    if setup.shards is not None:
+        return setup.shards.absolute()
     return made_shards(setup.folder, setup.sizes.homes, len(os.sched_getaffinity(0))).absolute()
 
 
-def _changes(setup: Setup, batch: int) -> tuple[str, ...]:
+def changes_of(setup: Setup, batch: int) -> tuple[str, ...]:
     return (*setup.sizes.changes, f"layout.batch_size={batch}", f"shape.batch_size={batch}")

@@ -4,6 +4,7 @@ objects (supplement B, Eq. S2 and S3)."""
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -116,13 +117,13 @@ def assign(
     """
     from scipy.optimize import linear_sum_assignment  # takes half a second; training only
 
-    prediction = torch.zeros(len(cost), cost.shape[2], dtype=torch.int64)
+    prediction = np.zeros((len(cost), cost.shape[2]), dtype=np.int64)
     # SciPy rejects NaN. The loss will be NaN, too, and its check names the rooms.
     matrices = cost.detach().nan_to_num().cpu().numpy()
     for room, (count, many) in enumerate(zip(predictions, objects, strict=True)):
         rows, columns = linear_sum_assignment(matrices[room, :count, :many])
-        prediction[room, torch.from_numpy(columns)] = torch.from_numpy(rows)
-    return prediction.to(cost.device)
+        prediction[room, columns] = rows
+    return torch.from_numpy(prediction).to(cost.device)
 
 
 def side_distance(

@@ -224,9 +224,9 @@ class ScenePrior(nn.Module):
         """Decode rooms from points of the latent space; `with_shape` adds shapes.
 
         If `with_shape` is not a bool, it holds the indices (room, object) of the objects that get a
-        mesh; all vertices of the others lie at the centre of their box. `wanted` limits what is decoded: as many
-        predictions as it has columns, and meshes only where it is true. Predictions after a room's
-        last true entry are meaningless. None decodes all N.
+        mesh; all vertices of the others lie at the centre of their box. `wanted` limits what is
+        decoded: as many predictions as it has columns, and meshes only where it is true.
+        Predictions after a room's last true entry are meaningless. None decodes all N.
         """
         count = self.max_objects if wanted is None else wanted.shape[1]
         needed = None

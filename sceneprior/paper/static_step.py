@@ -1,9 +1,9 @@
 """The parts of a training step whose tensors have the same shapes in every batch, as CUDA graphs.
 
-A step of the network launches thousands of small kernels, and Python takes longer to launch them than
-a GPU takes to run them. Here all rooms go through all N steps of the transformer, the boxes of all
-predictions are computed, and the last batch of an epoch is padded (`SceneViews.padded`), so that the
-launches are the same in every step.
+A step of the network launches thousands of small kernels, and Python takes longer to launch them
+than a GPU takes to run them. Here all rooms go through all N steps of the transformer, the boxes of
+all predictions are computed, and the last batch of an epoch is padded (`SceneViews.padded`), so
+that the launches are the same in every step.
 """
 
 from dataclasses import replace

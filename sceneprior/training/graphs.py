@@ -1,5 +1,5 @@
-"""CUDA graphs: functions whose launches are captured once and then replayed together, and values that
-are copied to the host while the GPU goes on."""
+"""CUDA graphs: functions whose launches are captured once and then replayed together, and values
+that are copied to the host while the GPU goes on."""
 
 import warnings
 from collections.abc import Callable
@@ -87,4 +87,3 @@ class OnHost:
         if self._done is not None:
             self._done.synchronize()
         return self._copies
-

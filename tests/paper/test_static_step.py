@@ -1,4 +1,4 @@
-"""Steps with static shapes, without a GPU: the capture of CUDA graphs is replaced by a plain call."""
+"""Steps with static shapes, without a GPU: a plain call replaces the capture of CUDA graphs."""
 
 import contextlib
 import warnings
@@ -111,8 +111,8 @@ def test_a_capture_that_fails_is_a_line_and_training_goes_on(toy_shards, tmp_pat
         trained(tiny_config(toy_shards), tmp_path / "run", True, monkeypatch, fails)
     said = {str(warning.message) for warning in told if warning.category is InputWarning}
     assert said == {
-        f"No CUDA graph of {name} (RuntimeError: operation not permitted when stream is capturing); "
-        "training goes on without it, more slowly."
+        f"No CUDA graph of {name} (RuntimeError: operation not permitted when stream is "
+        "capturing); training goes on without it, more slowly."
         for name in ("the decoder", "the 2D boxes", "the matching cost", "the layout losses")
     }
 

@@ -126,7 +126,7 @@ def render_scene(
         blur_px2 = math.log(1 / 1e-4 - 1) * sigma_px2
     if not blur_px2 >= 0:
         raise ValueError(f"blur_px2 is {blur_px2}; it must not be negative")
-    rooms, objects, vertices = vertices_m.shape[:3]
+    rooms, objects = vertices_m.shape[:2]
     views = world_to_camera.shape[1]
     _check_values(vertices_m, faces, world_to_camera, intrinsics)
     if drawn is None:

@@ -1,0 +1,218 @@
+"""The part `graphs` of `gpu.py`: training with CUDA graphs against training without, its speed and
+weights; the hours of the paper's schedule."""
+
+import statistics
+import tempfile
+import time
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from gpu_parts import PAPER_ROOMS, Setup, changes_of, peak_mib, shards_of
+from lightning.pytorch.callbacks import Callback
+from timed_fit import CONFIG, paper_run
+from torch import Tensor
+
+from sceneprior.apps.config import load_config
+from sceneprior.core.settings import find_config
+from sceneprior.training import graphs
+from sceneprior.training.fit import fit
+from sceneprior.training.method import RunConfig, read_checkpoint
+
+STAGES = ("layout", "shape")
+
+
+class Pace(Callback):
+    """The time from step to step with the loading of batches, synchronised only at both ends."""
+
+    def __init__(self, matmul: str = "high") -> None:
+        self.matmul = matmul
+        self.steps_s: dict[str, list[float]] = {}
+        """Mean seconds of a step, by stage and epoch."""
+        self.epochs_s: dict[str, list[float]] = {}
+        """Start times of the epochs, by stage."""
+
+    def on_train_start(self, trainer, pl_module) -> None:
+        torch.set_float32_matmul_precision(self.matmul)  # `fit` sets "high"
+        self.stage = Path(trainer.default_root_dir).name
+        self.steps_s[self.stage], self.epochs_s[self.stage] = [], []
+
+    def on_train_epoch_start(self, trainer, pl_module) -> None:
+        self.epochs_s[self.stage].append(_now_s())
+
+    def on_train_batch_start(self, trainer, pl_module, batch, batch_idx) -> None:
+        steps = int(trainer.num_training_batches)
+        first = min(5, steps // 4)  # worker processes are ahead by then
+        if batch_idx == first:
+            self._began = _now_s()
+        if batch_idx == steps - 1 > first:
+            self.steps_s[self.stage].append((_now_s() - self._began) / (steps - 1 - first))
+
+    def figures(self, stage: str, steps: int, batch: int, epochs: int) -> dict[str, float]:
+        """Milliseconds of a step and between epochs in the second half of the epochs, and the hours
+        of a whole stage of the paper's rooms."""
+        half = len(self.steps_s[stage]) // 2
+        step_s = statistics.median(self.steps_s[stage][half:])
+        starts = self.epochs_s[stage][half:]
+        epoch_s = (starts[-1] - starts[0]) / (len(starts) - 1)
+        between_s = max(epoch_s - steps * step_s, 0.0)
+        whole = -(-PAPER_ROOMS * 4 // batch)
+        hours = epochs * (whole * step_s + between_s) / 3600
+        return {"step_ms": 1e3 * step_s, "between_epochs_ms": 1e3 * between_s, "whole_h": hours}
+
+
+def _now_s() -> float:
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+    return time.perf_counter()
+
+
+@contextmanager
+def told_failures() -> Iterator[None]:
+    """Print the whole error of a capture that fails; `fit` says one line, and goes on."""
+    capture = graphs.captured
+
+    def told(function: Any, samples: tuple[Tensor, ...]) -> Any:
+        start = time.perf_counter()
+        try:
+            found = capture(function, samples)
+        except Exception:
+            print("A CAPTURE FAILED:", traceback.format_exc(), flush=True)
+            raise
+        print(f"captured in {time.perf_counter() - start:.2f} s", flush=True)
+        return found
+
+    graphs.captured = told
+    try:
+        yield
+    finally:
+        graphs.captured = capture
+
+
+@contextmanager
+def plain_calls() -> Iterator[None]:
+    """Replace captures by plain calls of the same functions."""
+    capture = graphs.captured
+    graphs.captured = lambda function, samples: function
+    try:
+        yield
+    finally:
+        graphs.captured = capture
+
+
+def speed(setup: Setup) -> None:
+    """Time both stages of the paper's run, with graphs and without, at both batch sizes."""
+    whole = load_config(str(find_config(CONFIG)))
+    hours: dict[tuple[str, int], float] = {}
+    for batch in (setup.sizes.rooms, setup.sizes.large_batch):
+        for how in ("graphs", "eager"):
+            workers = () if batch == setup.sizes.rooms else ("data.workers=8",)
+            if setup.device == "cpu":
+                workers = ()
+            config = _run(setup, batch, how == "graphs", *workers)
+            pace = Pace()
+            tried = _tried(setup, f"{how}, {batch} rooms")
+            with peak_mib(setup.device) as peak, tried, told_failures():
+                _fit(setup, config, [pace])
+                steps = -(-_rows(config) // batch)
+                for stage in STAGES:
+                    epochs = getattr(whole, stage).epochs
+                    figures = pace.figures(stage, steps, batch, epochs)
+                    hours[how, batch] = hours.get((how, batch), 0) + figures["whole_h"]
+                    what = f"{stage} stage, {how}, {batch} rooms per batch"
+                    setup.note(what, figures | {"peak_mib": peak()})
+                what = f"all of {CONFIG} on {PAPER_ROOMS:,} rooms, {how}, {batch} rooms per batch"
+                setup.note(what, {"whole_h": hours[how, batch]})
+
+
+def same_training(setup: Setup) -> None:
+    """Compare the weights after 20 steps of each stage with those of plain training.
+
+    `off` is the distance of the weights over the distance that they moved. The noise of float32 is
+    its value for the same functions without graphs ('plain calls'), or in another order ('eager').
+    """
+    few = ("data.workers=0", f"data.views_per_room={min(5, 2 * setup.sizes.rooms)}")
+    few += ("layout.epochs=1", "shape.epochs=1")
+    ends: dict[str, dict[str, dict[str, Tensor]]] = {}
+    for rate in (0.0, 0.1):
+        rated = (*few, f"model.decoder.dropout={rate}")
+        for how in ("graphs", "plain calls", "eager") if rate == 0 else ("graphs", "plain calls"):
+            config = _run(setup, setup.sizes.rooms, how != "eager", *rated)
+            with _tried(setup, f"{how}, dropout {rate}"), tempfile.TemporaryDirectory() as name:
+                with plain_calls() if how == "plain calls" else told_failures():
+                    _fit(setup, config, [Pace("highest")], Path(name) / "run", 20)
+                ends[how] = {stage: _weights(Path(name) / "run", stage) for stage in STAGES}
+        start = _start(config)
+        for one, other in (
+            ("graphs", "plain calls"),
+            ("graphs", "eager"),
+            ("plain calls", "eager"),
+        ):
+            if one in ends and other in ends:
+                of = f"{one} and {other}, dropout {rate}"
+                _compare(setup, of, ends[one], ends[other], start)
+        ends = {}
+
+
+def graphs_part(setup: Setup) -> None:
+    """Speed first: it is what a short lease is for."""
+    speed(setup)
+    same_training(setup)
+
+
+def _compare(setup: Setup, of: str, one: Any, other: Any, start: dict[str, Tensor]) -> None:
+    before = start
+    for stage in STAGES:
+        names = [name for name in other[stage] if other[stage][name].is_floating_point()]
+        moved = torch.cat([(other[stage][name] - before[name]).flatten() for name in names])
+        apart = torch.cat([(one[stage][name] - other[stage][name]).flatten() for name in names])
+        off = float(apart.norm() / moved.norm())
+        setup.note(f"{stage} stage: {of}", {"off": off, "largest": float(apart.abs().max())})
+        before = other[stage]
+
+
+def _run(setup: Setup, batch: int, with_graphs: bool, *changes: str) -> RunConfig:
+    graphed = tuple(f"{stage}.cuda_graphs={str(with_graphs).lower()}" for stage in STAGES)
+    # Loader processes of the shape stage have then read most images.
+    epochs = () if setup.device == "cpu" else ("shape.epochs=6",)
+    sizes = changes_of(setup, batch)
+    return paper_run(shards_of(setup), 3, *epochs, *sizes, *graphed, *changes)
+
+
+def _fit(
+    setup: Setup, config: RunConfig, callbacks: list[Callback], run: Path | None = None,
+    most: int | None = None,
+) -> None:  # fmt: skip
+    options: dict[str, Any] = {"accelerator": setup.device, "devices": 1, "callbacks": callbacks}
+    if most is not None:
+        options["limit_train_batches"] = most
+    with tempfile.TemporaryDirectory() as name:
+        fit(config, run or Path(name) / "run", loggers=("csv",), trainer_options=options)
+
+
+@contextmanager
+def _tried(setup: Setup, what: str) -> Iterator[None]:
+    """Go on after an error, which is printed and becomes a row."""
+    print(f"{what} ...", flush=True)
+    start = time.perf_counter()
+    try:
+        yield
+    except Exception as error:
+        print(traceback.format_exc(), flush=True)
+        setup.note(f"{what}: {' '.join(str(error).split())[:200]}", {})
+    print(f"{what}: {time.perf_counter() - start:.1f} s", flush=True)
+
+
+def _rows(config: RunConfig) -> int:
+    return len(config.stages()[0].open_data())
+
+
+def _weights(run: Path, stage: str) -> dict[str, Tensor]:
+    return read_checkpoint(run / stage / "final.ckpt")["state_dict"]
+
+
+def _start(config: RunConfig) -> dict[str, Tensor]:
+    return config.networks("layout", _rows(config)).state_dict()
