@@ -18,6 +18,8 @@ from torch import Tensor
 
 from sceneprior.apps.config import load_config
 from sceneprior.core.settings import find_config
+from sceneprior.paper.stages import PaperStage
+from sceneprior.paper.static_step import StaticStep
 from sceneprior.training import graphs
 from sceneprior.training.fit import fit
 from sceneprior.training.method import RunConfig, read_checkpoint
@@ -44,21 +46,21 @@ class Pace(Callback):
         self.epochs_s[self.stage].append(_now_s())
 
     def on_train_batch_start(self, trainer, pl_module, batch, batch_idx) -> None:
-        steps = int(trainer.num_training_batches)
+        self.steps = steps = int(trainer.num_training_batches)
         first = min(5, steps // 4)  # worker processes are ahead by then
         if batch_idx == first:
             self._began = _now_s()
         if batch_idx == steps - 1 > first:
             self.steps_s[self.stage].append((_now_s() - self._began) / (steps - 1 - first))
 
-    def figures(self, stage: str, steps: int, batch: int, epochs: int) -> dict[str, float]:
+    def figures(self, stage: str, batch: int, epochs: int) -> dict[str, float]:
         """Milliseconds of a step and between epochs in the second half of the epochs, and the hours
         of a whole stage of the paper's rooms."""
         half = len(self.steps_s[stage]) // 2
         step_s = statistics.median(self.steps_s[stage][half:])
         starts = self.epochs_s[stage][half:]
         epoch_s = (starts[-1] - starts[0]) / (len(starts) - 1)
-        between_s = max(epoch_s - steps * step_s, 0.0)
+        between_s = max(epoch_s - self.steps * step_s, 0.0)
         whole = -(-PAPER_ROOMS * 4 // batch)
         hours = epochs * (whole * step_s + between_s) / 3600
         return {"step_ms": 1e3 * step_s, "between_epochs_ms": 1e3 * between_s, "whole_h": hours}
@@ -116,11 +118,10 @@ def speed(setup: Setup) -> None:
             pace = Pace()
             tried = _tried(setup, f"{how}, {batch} rooms")
             with peak_mib(setup.device) as peak, tried, told_failures():
-                _fit(setup, config, [pace])
-                steps = -(-_rows(config) // batch)
+                _fit(setup, config, [pace], setup.sizes.steps)
                 for stage in STAGES:
                     epochs = getattr(whole, stage).epochs
-                    figures = pace.figures(stage, steps, batch, epochs)
+                    figures = pace.figures(stage, batch, epochs)
                     hours[how, batch] = hours.get((how, batch), 0) + figures["whole_h"]
                     what = f"{stage} stage, {how}, {batch} rooms per batch"
                     setup.note(what, figures | {"peak_mib": peak()})
@@ -143,7 +144,13 @@ def same_training(setup: Setup) -> None:
             config = _run(setup, setup.sizes.rooms, how != "eager", *rated)
             with _tried(setup, f"{how}, dropout {rate}"), tempfile.TemporaryDirectory() as name:
                 with plain_calls() if how == "plain calls" else told_failures():
-                    _fit(setup, config, [Pace("highest")], Path(name) / "run", 20)
+                    _fit(
+                        setup,
+                        config,
+                        [Pace("highest")],
+                        setup.sizes.compared_steps,
+                        Path(name) / "run",
+                    )
                 ends[how] = {stage: _weights(Path(name) / "run", stage) for stage in STAGES}
         start = _start(config)
         for one, other in (
@@ -183,14 +190,32 @@ def _run(setup: Setup, batch: int, with_graphs: bool, *changes: str) -> RunConfi
 
 
 def _fit(
-    setup: Setup, config: RunConfig, callbacks: list[Callback], run: Path | None = None,
-    most: int | None = None,
-) -> None:  # fmt: skip
+    setup: Setup, config: RunConfig, callbacks: list[Callback], steps: int, run: Path | None = None
+) -> None:
     options: dict[str, Any] = {"accelerator": setup.device, "devices": 1, "callbacks": callbacks}
-    if most is not None:
-        options["limit_train_batches"] = most
-    with tempfile.TemporaryDirectory() as name:
+    options["limit_train_batches"] = steps
+    with tempfile.TemporaryDirectory() as name, static_steps(setup.device):
         fit(config, run or Path(name) / "run", loggers=("csv",), trainer_options=options)
+
+
+@contextmanager
+def static_steps(device: str) -> Iterator[None]:
+    """In a trial on a CPU, take the steps that are captured on a GPU, as plain calls."""
+    use_graphs = PaperStage.use_graphs
+
+    def use(stage: PaperStage, trainer: Any) -> bool:
+        if stage.stage.cuda_graphs:
+            stage.static = StaticStep(
+                stage.prior, stage.stage, stage.loss, stage.completeness_target
+            )
+        return stage.stage.cuda_graphs
+
+    if device == "cpu":
+        PaperStage.use_graphs = use
+    try:
+        yield
+    finally:
+        PaperStage.use_graphs = use_graphs
 
 
 @contextmanager

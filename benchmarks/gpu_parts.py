@@ -53,6 +53,10 @@ class Sizes:
     homes: int = 96
     """Procedural homes, 67 of them for training: 268 rows with their turned copies."""
     epochs: int = 5
+    steps: int = 40
+    """Most steps of an epoch in the part `graphs`."""
+    compared_steps: int = 20
+    """Steps after which that part compares weights."""
     changes: tuple[str, ...] = ()
     """Changes to the paper's config."""
     kernels: tuple[tuple[str, str, torch.dtype], ...] = tuple(
@@ -64,7 +68,7 @@ class Sizes:
 PAPER = Sizes()
 TINY = Sizes(
     compared_level=1, compared_objects=2, compared_views=1, compared_shrink=6, levels=(0,), rooms=2,
-    large_batch=4, repeats=1, homes=6, epochs=3,
+    large_batch=4, repeats=1, homes=6, epochs=3, steps=3, compared_steps=2,
     changes=(
         "model.width=16", "model.decoder.heads=2", "model.decoder.hidden=16", "data.workers=0",
         "model.latent_space.anchors=10", "model.shape.width=8", "model.shape.level=1",
