@@ -41,11 +41,11 @@ MAY_TOO = {
 
 BUDGET = {
     "data_prep": (12805, 60),
-    "sceneprior/core": (5810, 28),
+    "sceneprior/core": (5901, 28),
     "sceneprior/furniture": (591, 4),
-    "sceneprior/render": (4604, 23),
-    "sceneprior/training": (1148, 6),
-    "sceneprior/paper": (2406, 12),
+    "sceneprior/render": (4613, 23),
+    "sceneprior/training": (1239, 7),
+    "sceneprior/paper": (2695, 13),
     "sceneprior/lifted": (8262, 42),
     "sceneprior/baselines": (2909, 14),
     "sceneprior/evaluation": (4557, 21),

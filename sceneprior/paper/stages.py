@@ -116,7 +116,7 @@ class PaperStage(LatentStage):
         on_gpu = trainer.strategy.root_device.type == "cuda"
         if not (on_gpu and self.stage.cuda_graphs):
             return False
-        if trainer.world_size > 1 or self.stage.accumulate > 1:
+        if trainer.world_size > 1 or trainer.accumulate_grad_batches > 1:
             cause = "several processes train together"
             if trainer.world_size == 1:
                 cause = "gradients of several batches are averaged"
@@ -143,6 +143,9 @@ class PaperStage(LatentStage):
         if self.trainer.is_last_batch:  # before the epoch's checkpoint
             self._check_last()
         return total
+
+    def on_train_end(self) -> None:
+        self._check_last()  # training may end within an epoch
 
     def _check_last(self) -> None:
         if self._unchecked is not None:

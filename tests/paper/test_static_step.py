@@ -118,17 +118,19 @@ def test_a_capture_that_fails_is_a_line_and_training_goes_on(toy_shards, tmp_pat
 
 
 def test_graphs_are_used_on_one_gpu_alone(tmp_path, monkeypatch):
-    trainer = lightning.Trainer(logger=False, enable_checkpointing=False, **CPU)
-    monkeypatch.setattr(type(trainer.strategy), "root_device", torch.device("cuda"))
-
-    def uses(**changes) -> bool:
+    def uses(devices: int = 1, accumulate: int = 1, **changes) -> bool:
+        trainer = lightning.Trainer(
+            logger=False, enable_checkpointing=False, accumulate_grad_batches=accumulate, **CPU
+        )
         config = tiny_config(tmp_path, **changes)
         stage = LayoutStage(config, config.layout, config.build_prior(), config.build_latents(2))
-        return stage.use_graphs(trainer)
+        with monkeypatch.context() as patch:
+            patch.setattr(type(trainer.strategy), "root_device", torch.device("cuda"))
+            patch.setattr(lightning.Trainer, "world_size", devices)
+            return stage.use_graphs(trainer)
 
     assert uses() and not uses(layout__cuda_graphs=False)
     with pytest.warns(InputWarning, match="^Gradients of several batches are averaged, so steps"):
-        assert not uses(layout__accumulate=2)
-    monkeypatch.setattr(lightning.Trainer, "world_size", 2)
+        assert not uses(accumulate=2)
     with pytest.warns(InputWarning, match="^Several processes train together, so steps are not"):
-        assert not uses()
+        assert not uses(devices=2)
