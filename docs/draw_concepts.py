@@ -28,7 +28,7 @@ from data_prep.front.recipe import load_recipe
 from data_prep.front.source import FrontSource
 from data_prep.homes.make import make_homes
 from data_prep.inspection.pictures import draw_view
-from sceneprior.apps.viewer.explorer import make_map
+from sceneprior.apps.viewer.map import make_map
 from sceneprior.core.cameras import project
 from sceneprior.core.classes import class_colors, label_set
 from sceneprior.core.observations import RoomViews, thinned

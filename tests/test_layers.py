@@ -50,7 +50,7 @@ BUDGET = {
     "sceneprior/baselines": (2909, 14),
     "sceneprior/evaluation": (4557, 21),
     "sceneprior/interchange": (892, 5),
-    "sceneprior/apps": (6277, 34),
+    "sceneprior/apps": (6714, 39),
 }
 """Most lines and modules of a folder. They go down freely, and up only in a commit that says what
 it bought and what went for it."""

@@ -291,8 +291,9 @@ def view(
     from sceneprior.apps.api import load
     from sceneprior.apps.retrieval.cad_models import open_models
     from sceneprior.apps.sample import with_floor_of_file
-    from sceneprior.apps.viewer.explorer import Explorer, Folder
+    from sceneprior.apps.viewer.explorer import Explorer
     from sceneprior.apps.viewer.panel import open_page
+    from sceneprior.apps.viewer.shown import Folder
     from sceneprior.render.scene_files import load_scene_folder
 
     folder = Path(where)

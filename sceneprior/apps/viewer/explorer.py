@@ -1,189 +1,47 @@
-"""The viewer's rooms, without a page: those of a trained prior, with a map of its latent space, or
-those of a folder of scenes, and their files for download."""
+"""The viewer's rooms of a trained prior, without a page: requested, completed, or decoded."""
 
-import io
-import zipfile
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+import contextlib
+from collections import Counter
+from dataclasses import asdict, replace
 from functools import cached_property
-from pathlib import Path
-from tempfile import TemporaryDirectory
-from types import MappingProxyType
 from typing import Any
 
-import torch
-from jaxtyping import Float, Int
+import numpy as np
+from jaxtyping import Float
 from torch import Tensor
 
 from sceneprior.apps.api import Prior
+from sceneprior.apps.viewer.map import LatentMap, Point, make_map
+from sceneprior.apps.viewer.requested import clauses_of, line_of, read_line, sentence_of
+from sceneprior.apps.viewer.shown import NOTHING_ASKED, Shown
 from sceneprior.core.errors import InputError
-from sceneprior.core.scene import Scene, SceneObject
-from sceneprior.core.shell import ShellName
-from sceneprior.evaluation.metrics.contents import common_label_set
-from sceneprior.interchange.export import SIMULATORS, export_scenes
+from sceneprior.core.scene import Opening, Scene
 from sceneprior.lifted.config import SAMPLER, TrainedLifted
+from sceneprior.lifted.requests.checks import answers
+from sceneprior.lifted.requests.request import RoomRequest
+from sceneprior.lifted.requests.wishes import Conditions, Wishes
 from sceneprior.paper.interpolate import RoomPath, even_places
-from sceneprior.paper.prior import LatentSpace, LatentSphere, TrainedPrior
+from sceneprior.paper.prior import TrainedPrior
 from sceneprior.paper.sampling import (
     DISTRIBUTIONS,
     decode_latents,
     named_latent,
     with_training_latents,
 )
-from sceneprior.render.scene_files import check_names, save
 
-FORMATS = {
-    "GLB": ".glb", "JSON": ".json", "OBJ": "obj", "USD": "usd", "MuJoCo (MJCF)": "mujoco",
-    "Habitat": "habitat", "SceneEval": "sceneeval", "ATISS": "atiss", "3D-FRONT": "threed-front",
-}  # fmt: skip
-"""Formats of downloads: endings for `save`, or formats of `export_scenes`."""
 PATH_STEPS = 49
 """Number of rooms of a path with both ends; neighbours are rarely more than 4 degrees apart."""
 HERE = "here"
 """Text that names the shown room as an end of a path."""
-NOTHING_ASKED: Mapping[str, Any] = MappingProxyType({})
-MARGIN = 0.12
-"""Margin around the outermost training rooms, as a share of the map's side."""
-RIM = 0.999
-"""Largest distance from the origin on the map of a sphere. At the rim, distance 1, the latent's
-other coordinates would all become 0."""
-SNAP = 0.02
-"""Distance within which a click selects a training room, as a share of the map's side."""
-
-
-@dataclass(frozen=True)
-class LatentMap:
-    """Orthographic projection of the latent space: latent z is at the point (a_1 . z, a_2 . z).
-
-    The orthonormal axes a_1 and a_2 are the first two principal components of the training rooms'
-    latents, so no other plane shows more of their variance. A great circle projects to an arc of an
-    ellipse. Moving over the map changes two coordinates and keeps the others in proportion. A click
-    on a training room's dot gives that room itself.
-    """
-
-    space: LatentSpace
-    axes: Float[Tensor, "2 dimension"]
-    rooms: Float[Tensor, "rooms 2"]
-    """Map points of the training rooms."""
-    share: float
-    """Explained variance: the share of the latents' variance along the two axes, 0 to 1."""
-    middle: tuple[float, float]
-    side: float
-    """Side of the square that the map shows, which contains all training rooms."""
-
-    def place(self, z: Float[Tensor, "rooms dimension"]) -> Float[Tensor, "rooms 2"]:
-        """Map points of latents."""
-        return z @ self.axes.T
-
-    def moved(
-        self, z: Float[Tensor, " dimension"], point: tuple[float, float]
-    ) -> Float[Tensor, " dimension"]:
-        """Move latent z to a point of the map, keeping its other coordinates.
-
-        On the sphere the other coordinates are scaled so that the length stays 1, and a point
-        beyond the rim is moved to it.
-        """
-        here = torch.tensor(point, dtype=z.dtype)
-        rest = z - self.axes.T @ (self.axes @ z)
-        if isinstance(self.space, LatentSphere):
-            here = here * (RIM / here.norm().clamp(min=RIM))
-            rest = rest * ((1 - here.square().sum()).sqrt() / rest.norm().clamp(min=1e-6))
-        return self.space.onto((rest + self.axes.T @ here).unsqueeze(0))[0]
-
-    def room_at(self, point: tuple[float, float]) -> int | None:
-        """The training room that a click at a point selects; None if no dot is near."""
-        apart = (self.rooms - torch.tensor(point, dtype=self.rooms.dtype)).norm(dim=1)
-        row = int(apart.argmin())
-        return row if float(apart[row]) <= SNAP * self.side else None
-
-
-def make_map(space: LatentSpace, z: Float[Tensor, "rooms dimension"]) -> LatentMap:
-    """Make the map of a latent space from the training rooms' latents z.
-
-    Example: on the sphere in three dimensions, rooms differ most along x, then along y.
-
-        >>> space = LatentSphere(4, 3)
-        >>> z = [[0.6, 0.0, 0.8], [-0.6, 0.0, 0.8], [0.0, 0.3, 0.954], [0.0, -0.3, 0.954]]
-        >>> latent_map = make_map(space, torch.tensor(z))
-        >>> latent_map.rooms[0].abs().tolist()
-        [0.6000000238418579, 0.0]
-        >>> latent_map.moved(torch.tensor(z[0]), (0.0, 0.0)).tolist()
-        [0.0, 0.0, 1.0]
-    """
-    if len(z) < 3:
-        raise InputError(
-            f"A map of the latent space needs at least 3 training rooms, and this prior knows "
-            f"{len(z)}; sample rooms instead."
-        )
-    _, scale, directions = torch.linalg.svd(z - z.mean(dim=0), full_matrices=False)
-    # The signs of singular vectors are arbitrary: the largest entry becomes positive.
-    largest: Int[Tensor, "2 1"] = directions[:2].abs().argmax(dim=1, keepdim=True)
-    axes = directions[:2] * directions.gather(1, largest).sign()
-    rooms = z @ axes.T
-    low, high = rooms.amin(dim=0), rooms.amax(dim=0)
-    side = max(float((high - low).max()), 1e-3) * (1 + 2 * MARGIN)
-    share = float(scale[:2].square().sum() / scale.square().sum().clamp(min=1e-12))
-    x, y = ((low + high) / 2).tolist()
-    return LatentMap(space, axes, rooms, share, (x, y), side)
-
-
-def name_and_size(item: SceneObject) -> str:
-    """Text of an object's label: class name, and width, height and depth in metres.
-
-    >>> name_and_size(SceneObject("double_bed", (0.0, 0.5, 0.0), (1.8, 1.0, 2.1)))
-    'double bed 1.80 x 1.00 x 2.10 m'
-    """
-    return item.label.replace("_", " ") + " {:.2f} x {:.2f} x {:.2f} m".format(*item.size_m)
-
-
-@dataclass
-class Display:
-    """Choices of what is shown with a room."""
-
-    shell: ShellName
-    """Parts of the room itself. If neither floor nor walls are shown, a grid is."""
-    names: bool = False
-    """Names and sizes of all objects."""
-    boxes: bool = False
-    models: bool = False
-    """CAD models in place of the meshes of the prior or of the scene files."""
-
-
-@dataclass(frozen=True)
-class Shown:
-    """The shown room."""
-
-    scene: Scene
-    origin: str
-    """Origin of the room, in words."""
-    kept: frozenset[int] = frozenset()
-    """Indices of the objects that the next completion keeps."""
-
-    def toggled(self, item: int) -> "Shown":
-        """The same room with `kept` toggled for an object."""
-        return replace(self, kept=self.kept ^ {item})
-
-    def given(self) -> Scene:
-        """The scene of the kept objects alone."""
-        objects = tuple(self.scene.objects[item] for item in sorted(self.kept))
-        return replace(self.scene, objects=objects, extra={}, latent=None)
-
-
-class Folder:
-    """A folder of scenes, made by any method."""
-
-    def __init__(self, scenes: Sequence[Scene]):
-        self.scenes = tuple(scenes)
-
-    @property
-    def label_set(self) -> str:
-        """The label set of all scenes; several are an InputError."""
-        return common_label_set(self.scenes)
-
-    def room(self, row: int) -> Shown:
-        """The scene at an index."""
-        scene = self.scenes[row]
-        return Shown(scene, f"{scene.name}, {row + 1} of {len(self.scenes)}")
+_EXAMPLES = (
+    "4 x 3 m, a door, a double bed and two nightstands beside it",
+    "a desk under the window, a chair and no sofa",
+    "two single beds far from the door",
+    "5 x 4 m, a door, a sofa facing the tv stand",
+    "a coffee table in front of the sofa, two armchairs",
+    "a table and four chairs near it, a window",
+)
+"""Requests to try; the first three that a prior understands are offered."""
 
 
 class Explorer:
@@ -193,12 +51,8 @@ class Explorer:
         self.prior = prior
         self.label_set = prior.label_set
         self.map: LatentMap | None = None
-        self.without_map = ""
-        """The reason if there is no map, else empty."""
-        try:
+        with contextlib.suppress(InputError):  # latents of training rooms are optional
             self.map = make_map(prior.with_latents.prior.latent_space, self._training_z)
-        except InputError as error:
-            self.without_map = str(error)
         self.path: RoomPath | None = None
 
     @property
@@ -228,20 +82,73 @@ class Explorer:
         """True if a sampler draws rooms, as requests and completion need."""
         return SAMPLER in self.distributions
 
+    @cached_property
+    def examples(self) -> tuple[str, ...]:
+        """Three requests that this prior understands; none without a sampler."""
+        found = []
+        for line in _EXAMPLES if self.takes_requests else ():
+            with contextlib.suppress(InputError):
+                self.understood(RoomRequest.of(want=line))
+                found.append(line)
+        return tuple(found[:3])
+
+    @cached_property
+    def known(self) -> list[str]:
+        """Classes that the sampler draws."""
+        trained = self.prior.trained
+        assert isinstance(trained, TrainedLifted) and trained.sampler is not None, "a sampler"
+        return [self.prior.classes[row] for row in trained.sampler.drawn_classes]
+
+    def understood(self, request: RoomRequest) -> Conditions:
+        """A request as the prior understands it; InputError if it does not."""
+        trained = self.prior.trained
+        assert isinstance(trained, TrainedLifted) and trained.sampler is not None, "a sampler"
+        sampler, names = trained.sampler, self.prior.classes
+        meets = sampler.may_meet.nonzero().tolist()
+        may_meet = {frozenset(names[index] for index in pair) for pair in meets}
+        return request.conditions(
+            self.known, self.label_set, sampler.max_objects, may_meet=may_meet
+        )
+
+    def ticks(self, shown: Shown) -> list[tuple[str, bool]]:
+        """Each clause of the state's request, and whether the shown room meets it."""
+        if not shown.line:
+            return []
+        given, found = RoomRequest(objects=shown.request.objects), []
+        whole = self.understood(shown.request).wishes.bounds
+
+        def is_understood(text: str) -> bool:
+            with contextlib.suppress(InputError):
+                return bool(self.understood(read_line(text, given)))
+            return False
+
+        for text in clauses_of(shown.line, is_understood):
+            asked = self.understood(read_line(text, given))
+            # Of two clauses about a class, the numbers are added.
+            counts = tuple(
+                replace(wish, most=None) if whole[wish.label][1] > (wish.most or 0) else wish
+                for wish in asked.wishes.counts
+            )
+            asked = replace(asked, wishes=replace(asked.wishes, counts=counts))
+            found.append((text, self._holds(shown.scene, asked)))
+        return found
+
+    def _holds(self, scene: Scene, asked: Conditions) -> bool:
+        fronts = np.zeros((len(scene.objects), 2))  # drawn objects have yaws of their own
+        return all(each["holds"] for each in answers(scene, asked, fronts))
+
     def sample(
         self,
         seed: int,
         distribution: str | None = None,
-        asked: Mapping[str, Any] = NOTHING_ASKED,
+        request: RoomRequest = NOTHING_ASKED,
+        line: str = "",
     ) -> Shown:
         """Sample a new room, by default from the first of `distributions`.
 
         It equals the room of `sceneprior synthesize -n 1 --seed SEED` with the same request.
-
-        Args:
-            asked: Arguments of `Prior.sample` for a requested room.
         """
-        distribution = distribution or next(iter(self.distributions), None)
+        distribution, asked = distribution or next(iter(self.distributions), None), request.parts()
         if asked and distribution != SAMPLER:
             raise InputError(
                 f"Rooms from {distribution} answer no requests; choose {SAMPLER} under From, or "
@@ -249,23 +156,55 @@ class Explorer:
             )
         origin = distribution or self.prior.trained.config.method
         scene = self.prior.sample(1, seed, distribution, **asked)[0]
-        return Shown(scene, f"seed {seed}, from: {origin}{', as requested' if asked else ''}")
+        locked = frozenset(range(len(request.objects)))
+        line = line or line_of(request)
+        return Shown(scene, f"Room of seed {seed}, from {origin}", request, line, locked)
 
-    def complete(self, shown: Shown, seed: int, want: str = "") -> Shown:
-        """Complete the room around the kept objects, with wishes if there are any.
+    def complete(self, shown: Shown, seed: int) -> Shown:
+        """Complete the room around the locked objects, as its request wants it.
 
-        The shown room's floor, doors, windows and ceiling also stay.
+        The floor, doors, windows and ceiling also stay, unless the request has others by now.
         """
-        room = self.prior.complete(shown.given(), 1, seed, want=want or None)[0]
-        kept = frozenset(range(len(shown.kept)))
-        return Shown(room, f"completed around {len(kept)} kept objects, seed {seed}", kept)
+        given, more = shown.given(), dict[str, Any]()
+        if shown.request.parts():
+            asked, stays = self.understood(shown.request), True
+            if asked.floor is not None:
+                stays = np.array_equal(given.floor_m, asked.floor.outline_m)  # type: ignore[arg-type]
+                given = replace(given, floor_m=asked.floor.outline_m)
+            openings = replace(asked, floor=None, ceiling_m=None, wishes=Wishes())
+            if not (stays and self._holds(shown.scene, openings)):
+                given = replace(given, openings=())
+                told = [each if isinstance(each, Opening) else str(each) for each in asked.openings]
+                more["openings"] = told or None
+            more["want"] = sentence_of(asked.wishes) or None
+            more["ceiling_m"] = asked.ceiling_m
+        return self._completed(shown, given, seed, more)
+
+    def follow(self, shown: Shown, seed: int) -> Shown:
+        """Place the unlocked objects anew around the locked ones: as many of each class as there
+        are, with the relations of the request."""
+        counts = Counter(item.label for item in shown.scene.objects)
+        want: dict[str, Any] = {label: counts[label] for label in self.known}
+        if shown.request.parts():
+            relations = self.understood(shown.request).wishes.relations
+            want["relations"] = [asdict(wish) for wish in relations]
+        return self._completed(shown, shown.given(), seed, {"want": want})
+
+    def _completed(self, shown: Shown, given: Scene, seed: int, more: dict[str, Any]) -> Shown:
+        room = self.prior.complete(given, 1, seed, **more)[0]
+        count = len(given.objects)
+        pieces = f"{count} locked piece{'s' * (count > 1)}"
+        origin = f"Completed around {pieces}, seed {seed}"
+        return replace(
+            shown, scene=room, origin=origin, locked=frozenset(range(count)), picked=None
+        )
 
     def training_room(self, row: int) -> Shown:
         """A training room as the prior decodes it."""
         room_id = self.prior.trained.room_ids[row]
-        return self._decoded(self._training_z[row], room_id, f"training room {room_id}, decoded")
+        return self._decoded(self._training_z[row], room_id, f"Training room {room_id}, decoded")
 
-    def at(self, shown: Shown, point: tuple[float, float], click: bool = False) -> Shown:
+    def at(self, shown: Shown, point: Point, click: bool = False) -> Shown:
         """The room at a map point, which keeps the shown room's other latent coordinates.
 
         A click on a training room's dot gives that room.
@@ -277,7 +216,7 @@ class Explorer:
         start = self._training_z[0] if latent is None else self.prior.latent(latent)
         z = self.map.moved(start, point)
         x, y = self.map.place(z.unsqueeze(0))[0].tolist()
-        return self._decoded(z, "from_the_map", f"map {x:+.3f}, {y:+.3f}")
+        return self._decoded(z, "from_the_map", f"Map at {x:+.3f}, {y:+.3f}")
 
     def _decoded(self, z: Float[Tensor, " dimension"], name: str, origin: str) -> Shown:
         rooms = decode_latents(self.prior.with_latents, z.unsqueeze(0), [name])
@@ -305,35 +244,4 @@ class Explorer:
         assert self.path is not None, "a path is drawn first"
         place = even_places(PATH_STEPS)[[number]]
         (room,) = self.path.rooms(place, [f"step_{number:02d}"])
-        return Shown(room.scene, f"path, step {number} of {PATH_STEPS - 1}")
-
-
-def download(scene: Scene, form: str, shell: ShellName) -> tuple[str, bytes, list[str]]:
-    """The name of a room's file, its bytes, and notes for the user; several files are zipped.
-
-    Args:
-        form: One of `FORMATS`.
-        shell: Parts of the room itself to write, in the formats that leave a choice.
-
-    Raises:
-        InputError: the room cannot be written, or a package for it is not installed.
-    """
-    check_names([scene])
-    to, notes = FORMATS[form], []
-    with TemporaryDirectory() as name:
-        folder = Path(name)
-        if to.startswith("."):
-            save(scene, folder / f"{scene.name}{to}", shell=shell)
-        else:
-            chosen = shell if to in (*SIMULATORS, "obj") else None
-            notes = export_scenes([scene], to, folder, chosen)
-        files = sorted(path for path in folder.rglob("*") if path.is_file())
-        if len(files) == 1 and files[0].parent == folder:
-            return files[0].name, files[0].read_bytes(), notes
-        packed = io.BytesIO()
-        with zipfile.ZipFile(packed, "w") as archive:
-            for path in files:
-                # The entry has no date of today, so that the same room is the same file.
-                entry = zipfile.ZipInfo(path.relative_to(folder).as_posix())
-                archive.writestr(entry, path.read_bytes(), zipfile.ZIP_DEFLATED)
-    return f"{scene.name}_{to}.zip", packed.getvalue(), notes
+        return Shown(room.scene, f"Path, step {number} of {PATH_STEPS - 1}")

@@ -1,4 +1,4 @@
-"""The page in a real browser: it draws, the room follows the pointer, and buttons do their work."""
+"""The page in a real browser: each action of docs/uses.md, clicked through."""
 
 import contextlib
 import time
@@ -6,11 +6,11 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-import torch
 from browser import picture, wait_for
 
 import sceneprior
-from sceneprior.apps.viewer.explorer import Explorer, Folder
+from sceneprior.apps.viewer.explorer import Explorer
+from sceneprior.apps.viewer.shown import Folder
 from sceneprior.core.scene import Scene, SceneObject
 
 pytest.importorskip("viser", reason="the extra `view` is not installed")
@@ -19,6 +19,7 @@ from sceneprior.apps.viewer.panel import Panel, open_page
 from sceneprior.apps.viewer.server import serving
 
 pytestmark = pytest.mark.slow
+SIZES = {"desktop": (1280, 800), "phone": (390, 844)}
 
 
 def words(browser) -> str:
@@ -41,125 +42,179 @@ def on_screen(page, point_m) -> tuple[float, float]:
     )
 
 
-def canvas(browser) -> np.ndarray:
-    """What is drawn left of the panel."""
-    shown = picture(browser.get_screenshot_as_png)
-    return np.asarray(shown.crop((0, 0, int(0.65 * shown.width), shown.height))).astype(int)
-
-
 def click(browser, text: str) -> None:
-    browser.find_element("xpath", f"//*[text()='{text}']").click()
+    """Click the last control with this text, wherever the panel is scrolled to."""
+    found = browser.find_elements("xpath", f"//*[contains(text(), '{text}')]")
+    browser.execute_script("arguments[0].click()", found[-1])
+
+
+def move(browser, points, press: bool = True) -> None:
+    """Lead the pointer over points of the window, with its button pressed. Step by step: of a
+    browser that is slow to draw, a gesture at once is over before it is seen."""
+    from selenium.webdriver import ActionChains
+
+    for number, (x, y) in enumerate(points):
+        mouse = ActionChains(browser, duration=50)
+        mouse.w3c_actions.pointer_action.move_to_location(int(x), int(y))
+        if number == 0 and press:
+            mouse.w3c_actions.pointer_action.pointer_down()
+        mouse.perform()
+        time.sleep(0.2)
+    ActionChains(browser).release().perform()
 
 
 @contextlib.contextmanager
-def opened(browser, source, title: str, **more) -> Iterator[Panel]:
+def opened(browser, source, title: str, size: str = "desktop", **more) -> Iterator[Panel]:
     """A page in the browser, once its room is framed."""
+    width, height = SIZES[size]
     with serving("127.0.0.1", 0) as server:
         panel = open_page(server, source, title, **more)
-        server.scene.configure_default_lights(cast_shadow=False)  # half of the time in software
-        browser.set_window_size(1000, 700)
+        panel.page.sun.cast_shadow = False  # half of the time in software
+        metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
         browser.get_log("browser")
         browser.get(f"http://127.0.0.1:{server.get_port()}")
-        wait_for(lambda: "Whole room in view" in words(browser), "no panel came")
+        wait_for(lambda: "Walk in" in words(browser), "no panel came")
         wait_for(server.get_clients, "the browser did not connect")
-        # viser warns that WebGL is drawn in software, right over the board.
+        # viser warns that WebGL is drawn in software, right over the room.
         close = "document.querySelectorAll('.mantine-Notification-closeButton')"
         browser.execute_script(f"{close}.forEach(x => x.click())")
         yield panel
         browser.get("about:blank")
+        browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
-@pytest.fixture(scope="module")
-def page(browser, toy_run):
-    with opened(browser, Explorer(sceneprior.load(toy_run)), "toy rooms") as panel:
-        yield panel.page
-
-
-def test_the_room_follows_the_pointer(browser, page, monkeypatch):
-    from selenium.webdriver import ActionChains
-
-    assert "seed 0, from: paper" in words(browser)
-    wait_for(lambda: len(np.unique(canvas(browser) // 32)) > 4, "nothing is drawn")
-    before = canvas(browser)
-    latent_map = page.board.latent_map
-    places = [
-        (latent_map.middle[0] + t * latent_map.side, latent_map.middle[1] - t * latent_map.side)
-        for t in np.linspace(-0.3, 0.3, 7)
-    ]
-    shown = []
-    show = page.show
-
-    def noted(room, settled=True):
-        show(room, settled)
-        shown.append((room, settled))
-
-    monkeypatch.setattr(page, "show", noted)
-    points_m = page.board.in_scene(page.board.on_board(torch.tensor(places)))
-    points = [on_screen(page, point_m) for point_m in points_m]
-    # Step by step: of a browser that is slow to draw, a gesture at once is over before it is seen.
-    for number, (x, y) in enumerate(points):
-        mouse = ActionChains(browser, duration=50)
-        mouse.w3c_actions.pointer_action.move_to_location(int(x), int(y))
-        if number == 0:
-            mouse.w3c_actions.pointer_action.pointer_down()
-        mouse.perform()
-        time.sleep(0.1)
-    wait_for(lambda: shown, "no room followed the pointer")
-    ActionChains(browser).release().perform()
-    wait_for(lambda: shown[-1][1], "the drag did not end in a room")
-    last = shown[-1][0]
-    found = latent_map.place(torch.from_numpy(last.scene.latent)[None])[0]
-    # A pixel is 0.3% of the board; the room is where the pointer was let go.
-    np.testing.assert_allclose(found, places[-1], atol=0.02 * latent_map.side)
-    wait_for(lambda: last.origin in words(browser), "the panel does not say so")
-    wait_for(lambda: (np.abs(canvas(browser) - before).max(axis=-1) > 40).any(), "nothing moved")
-    # viser's own way of handling touches makes chromium complain, once a drag.
-    log = [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
-    assert [said for said in log if "passive event listener" not in said] == []
-
-
-def test_a_request_is_typed_answered_completed_and_downloaded(browser, tmp_path):
-    from selenium.webdriver import ActionChains
-
-    source, asked = Explorer(sceneprior.load("procthor-bedroom")), {"want": "two nightstands"}
+def test_a_room_is_asked_for_changed_and_saved(browser, tmp_path):
+    source = Explorer(sceneprior.load("procthor-bedroom"))
+    asked = {"want": "a 4 x 3 m bedroom with a door and two nightstands"}
     with opened(browser, source, "rooms", asked=asked) as panel:
         page = panel.page
-        for label, text in (("Floor", "5x4"), ("Doors", "door@3:1.2")):
-            field = f"//label[text()='{label}']/following::input[1]"
-            browser.find_element("xpath", field).send_keys(text)
-        wait_for(lambda: panel.request.text("openings") == "door@3:1.2", "nothing was typed")
-        click(browser, "Make room")
-        wait_for(lambda: page.scene.openings, "no room was made")
-        wait_for(
-            lambda: "1 door" in words(browser) and "✓ 2 nightstand" in words(browser), "silence"
-        )
-        np.testing.assert_allclose(np.ptp(page.scene.floor_m, axis=0), [5, 4])
-        item = page.shown.scene.objects[0]
-        x, y = on_screen(page, np.add(item.center_m, (0, item.size_m[1] / 2, 0)))
-        mouse = ActionChains(browser)
-        mouse.w3c_actions.pointer_action.move_to_location(int(x), int(y)).click()
-        mouse.perform()
-        wait_for(lambda: page.shown.kept, "no object is kept")
-        (row,) = page.shown.kept
-        kept = page.shown.scene.objects[row]
-        click(browser, "Complete the rest")
-        wait_for(lambda: "completed around 1 kept objects" in words(browser), "not completed")
-        assert page.shown.scene.objects[0].center_m == kept.center_m
+        first = page.shown
+        for clause in ("a 4 x 3 m bedroom", "a door", "two nightstands"):
+            assert f"✓ {clause}" in words(browser)
+        # The documented command: its sentence names the floor, and the room has one by then.
+        click(browser, "New room")
+        wait_for(lambda: page.shown.origin.startswith("Room of seed 1"), "no new room")
+        click(browser, "Undo")
+        wait_for(lambda: page.shown == first, "not undone")
+
+        field = browser.find_element("css selector", "textarea")
+        field.send_keys(" beside a purple bed\n")
+        wait_for(lambda: "not understood" in words(browser), "no error")
+        assert words(browser).count("not understood") == 1 and page.shown == first
+        browser.execute_script("arguments[0].select()", field)
+        field.send_keys("4 x 3 m, a door, a double bed, two nightstands\n")
+        wait_for(lambda: "✓ a double bed" in words(browser), "no room for the typed request")
+        assert "not understood" not in words(browser)
+        click(browser, "two nightstands")
+        wait_for(lambda: page.shown.line == "4 x 3 m, a door, a double bed", "the clause stayed")
+        click(browser, "Complete")
+        wait_for(lambda: "No piece is locked" in words(browser), "nothing was said")
+
+        row = [item.label for item in page.shown.scene.objects].index("double_bed")
+        bed = page.shown.scene.objects[row]
+        x, y = on_screen(page, np.add(bed.center_m, (0, bed.size_m[1] / 2, 0)))
+        move(browser, [(x, y)])
+        wait_for(lambda: page.shown.picked == row, "a click picks no piece")
+        click(browser, "Lock this piece")
+        wait_for(lambda: "Unlock this piece" in words(browser), "not locked")
+        click(browser, "Complete")
+        wait_for(lambda: "Completed around 1 locked piece" in words(browser), "not completed")
+        assert page.shown.scene.objects[0].center_m == bed.center_m
+
+        before = page.shown
+        x, y = on_screen(page, np.add(bed.center_m, (0, bed.size_m[1] / 2, 0)))
+        way = np.array(on_screen(page, (0.0, bed.size_m[1], 0.0))) - (x, y)
+        move(browser, [(x, y) + way * t for t in (0, 0.2, 0.4, 0.6)])
+        wait_for(lambda: page.shown.origin != before.origin, "the rest did not follow")
+        moved = page.shown.scene.objects[0].center_m
+        assert moved != bed.center_m and moved[1] == pytest.approx(bed.center_m[1])
+        labels = [sorted(e.label for e in s.scene.objects) for s in (before, page.shown)]
+        assert labels[0] == labels[1]
+        click(browser, "Replace by model")
+        wait_for(lambda: "retrieval" in page.shown.scene.extra, "no models")
+        wait_for(lambda: "✓ a double bed" in words(browser), "no ticks")
+
+        for view in ("From above", "Walk in", "From outside"):
+            (client,) = page.server.get_clients().values()
+            eye = client.camera.position.copy()
+            click(browser, view)
+            wait_for(lambda: np.abs(client.camera.position - eye).max() > 0.5, f"not {view}")  # noqa: B023
+        click(browser, "Save")
         folder = {"behavior": "allow", "downloadPath": str(tmp_path)}
         browser.execute_cdp_cmd("Page.setDownloadBehavior", folder)
-        button = browser.find_element("xpath", "//button[.//text()='Download']")
-        browser.execute_script("arguments[0].scrollIntoView(); arguments[0].click()", button)
-        file = tmp_path / f"{page.scene.name}.glb"
+        click(browser, "Download")
+        file = tmp_path / f"{page.shown.scene.name}.glb"
         wait_for(file.is_file, "no file came")
         assert b"wall_3" in file.read_bytes()
 
 
-def test_a_room_of_a_stranger_runs_nothing(browser):
+def test_the_room_follows_the_pointer_over_the_map_and_along_a_path(browser, toy_run):
+    with opened(browser, Explorer(sceneprior.load(toy_run)), "toy rooms") as panel:
+        page, latent_map = panel.page, panel.page.source.map
+        assert "Room of seed 0, from paper" in words(browser)
+        click(browser, "Map")
+        box = browser.find_element("css selector", "svg.sp-map").rect
+        points = [
+            (box["x"] + t * box["width"], box["y"] + t * box["height"]) for t in (0.3, 0.5, 0.7)
+        ]
+        move(browser, points)
+        goal = [
+            latent_map.middle[0] + 0.2 * latent_map.side,
+            latent_map.middle[1] - 0.2 * latent_map.side,
+        ]
+
+        def at() -> np.ndarray:
+            latent = page.shown.scene.latent
+            return np.asarray(latent_map.axes) @ latent
+
+        wait_for(lambda: np.abs(at() - goal).max() < 0.02 * latent_map.side, "not followed")
+        wait_for(lambda: page.shown.origin in words(browser), "the panel does not say so")
+        dot = browser.find_elements("css selector", "svg.sp-map circle")[5].rect
+        move(browser, [(dot["x"] + dot["width"] / 2, dot["y"] + dot["height"] / 2)])
+        wait_for(lambda: page.shown.origin.startswith("Training room"), "a dot is no room")
+        click(browser, "Path")
+        click(browser, "Draw path")
+        wait_for(lambda: "Path, step 0 of 48" in words(browser), "no path")
+        assert browser.find_elements("css selector", "svg.sp-map polyline")
+        log = [e["message"] for e in browser.get_log("browser") if e["level"] == "SEVERE"]
+        assert [said for said in log if "passive event listener" not in said] == []
+
+
+def test_on_a_phone_the_panel_is_a_drawer(browser):
+    source = Explorer(sceneprior.load("demo-bedroom"))
+    with opened(browser, source, "rooms", size="phone") as panel:
+        drawer = browser.find_element("css selector", ".mantine-Paper-root[style*='fixed']").rect
+        assert drawer["width"] == 390 and drawer["height"] <= 0.47 * 844
+        wide = "return document.documentElement.scrollWidth"
+        assert browser.execute_script(wide) == 390
+        for example in source.examples:
+            assert example in words(browser)
+
+        def drawn() -> np.ndarray:
+            shown = np.asarray(picture(browser.get_screenshot_as_png)).astype(int)
+            return np.argwhere(
+                np.abs(shown[: int(drawer["y"])] - (241, 239, 234)).sum(axis=-1) > 60
+            )
+
+        wait_for(lambda: len(drawn()) > 5000, "nothing is drawn")
+        low, high = drawn().min(axis=0), drawn().max(axis=0)
+        # The room fills the part above the drawer, and nothing of it is cut off or below.
+        assert (high - low)[1] > 0.75 * 390 and low.min() > 2 and high[1] < 388
+        assert high[0] < drawer["y"] - 5
+        click(browser, "two single beds")
+        wait_for(lambda: "✓ two single beds far from the door" in words(browser), "no room")
+        assert panel.page.shown.scene.openings
+
+
+def test_a_folder_of_a_stranger_is_shown_and_runs_nothing(browser):
     name = "<iframe srcdoc='<script>parent.hacked=1</script>'>"
     label = "<img src=x onerror=hacked=1>"
     item = SceneObject(label, (0.0, 0.5, 0.0), (1.0, 1.0, 1.0))
-    with opened(browser, Folder([Scene(name, f"void,{label}", (item,))]), label) as panel:
+    rooms = [Scene(name + each, f"void,{label}", (item,)) for each in "ab"]
+    with opened(browser, Folder(rooms), label) as panel:
         wait_for(lambda: name in words(browser), "the room's name is not shown as it is")
+        click(browser, "View")
         click(browser, "Names and sizes")
         wait_for(lambda: words(browser).count(label) >= 2, "class and title are not shown")
         assert panel.page.display.names

@@ -1,5 +1,6 @@
 """The page and its panel without a browser: cameras, requests, texts, furniture, downloads."""
 
+import contextlib
 import io
 import json
 import threading
@@ -12,24 +13,25 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
-import torch
 from refusals import refused
 
 import sceneprior
-from sceneprior.apps.viewer.explorer import FORMATS, Display, Explorer, Folder, download, make_map
+from sceneprior.apps.viewer.explorer import Explorer
+from sceneprior.apps.viewer.shown import FORMATS, Display, Folder, download
 from sceneprior.core.cameras import FILLED, framed, look_at
 from sceneprior.core.scene import Opening, Scene, SceneObject
 from sceneprior.core.shell import shell_of
 from sceneprior.interchange.export import FORMATS as EXPORT_FORMATS
 from sceneprior.interchange.export import export_scenes
-from sceneprior.paper.prior import LatentCube
 from sceneprior.render.scene_files import save
 
 pytest.importorskip("viser", reason="the extra `view` is not installed")
 
 from sceneprior.apps.viewer import page as pages
-from sceneprior.apps.viewer.panel import html, open_page, wishes_html
+from sceneprior.apps.viewer import views
+from sceneprior.apps.viewer.panel import Panel, open_page
 from sceneprior.apps.viewer.server import serving
+from sceneprior.apps.viewer.texts import html, wishes_html
 
 CLASS = "<img src=x onerror='hacked=1'>"
 NAME = "![](_icons/tabler-icons.zip) <iframe srcdoc='<script>parent.hacked=1</script>'>"
@@ -39,7 +41,7 @@ DOOR = Opening("door", (-0.5, -1.5), (0.4, -1.5), 0.0, 2.0)
 ROOM = Scene("mine", "front3d_bedroom", (BED,), FLOOR, openings=(DOOR,))
 
 
-@pytest.mark.parametrize("forward", [pages.CORNER, pages.FRONT])
+@pytest.mark.parametrize("forward", [views.CORNER, views.DOWN])
 @pytest.mark.parametrize("aspect", [0.4, 1.3, 3.0])
 def test_cameras_see_all_points_and_stand_no_further_away_than_they_must(forward, aspect, rng):
     points = rng.uniform([-4, 0, -2], [3, 2.6, 5], (40, 3))
@@ -60,14 +62,14 @@ def test_names_are_escaped_and_read_no_file(recwarn):
     room = Scene(NAME, f"void,{CLASS}", (item,), extra={"wishes": wishes})
     with serving("127.0.0.1", 0) as server:
         panel = open_page(server, Folder([room]), CLASS)
-        texts = [panel._room_text.content, panel._wishes_text.content]
+        texts = [panel._room_text.content]
         panel.page.show(panel.page.shown.toggled(0))
         texts.append(panel._room_text.content)
     assert not [warning for warning in recwarn if "image" in str(warning.message)]
     for text in (*texts, html(CLASS)):
         assert "&lt;img src=x onerror=&#39;hacked=1&#39;&gt;" in text
         assert "<img" not in text and "<iframe" not in text
-    assert "![]" in texts[0] and texts[1].count("not fulfilled") == 1
+    assert "![]" in texts[0] and texts[0].count("not fulfilled") == 1
     for other in (None, {}, CLASS, [], 3):
         assert not wishes_html(Scene(NAME, "front3d_bedroom", extra={"wishes": other}))
 
@@ -77,69 +79,115 @@ def prior():
     return sceneprior.load("procthor-bedroom")
 
 
-def test_a_request_is_answered_or_refused_in_the_panel(prior, tmp_path):
-    asked = {"floor": np.array([[0, 0], [4, 0], [4, 3], [0, 3]]), "want": {"nightstand": 2}}
+def chip(panel, text: str) -> str:
+    """The chip of a part, as it is written now."""
+    return next(option for option in panel._chips.options if text in option)
+
+
+def press(panel, control, value=None) -> None:
+    """Send what a browser sends when a control is used."""
+    if value is not None:
+        control._impl.value = value
+    for answer in control._impl.update_cb:
+        answer(SimpleNamespace(client=None))
+
+
+def test_the_page_owns_one_request(prior):
+    asked = {"want": "a 4 x 3 m bedroom with a door and two nightstands"}
     with serving("127.0.0.1", 0) as server:
         panel = open_page(server, Explorer(prior), "prior", asked=asked)
-        page, request, fields = panel.page, panel.request, panel.request.fields
-        assert "The command also requests: floor, want." in request.rest_text.content
-        assert "✓ 2 nightstand" in panel._wishes_text.content
-        fields["want"].value, fields["openings"].value = "double_bed: 1", "door@south,"
-        panel.sample(page.source, 1, None)
-        assert page.shown.origin == "seed 1, from: sampler, as requested"
-        assert "✓ 1 double bed" in panel._wishes_text.content
-        same = prior.sample(
-            1, 1, floor=asked["floor"], openings="door@south", want={"double_bed": 1}
-        )[0]
-        assert page.scene.without_meshes().objects == same.without_meshes().objects
-        assert page.scene.openings == same.openings
+        page, said = panel.page, []
+        page.tell = lambda text: said.append(text) if text else None
+        assert panel.line.value == asked["want"]
+        assert panel._chips.options == (
+            "✓ a 4 x 3 m bedroom  ×",
+            "✓ a door  ×",
+            "✓ two nightstands  ×",
+        )
+        first, same = page.shown.scene, prior.sample(1, 0, **asked)[0]
+        assert first.without_meshes().objects == same.without_meshes().objects
         assert "Floor: 4.00 x 3.00 m, 1 door" in panel._room_text.content
+        # A part less: the room stays, and the next one has another number of nightstands or not.
+        press(panel, panel._chips, chip(panel, "two nightstands"))
+        assert panel.line.value == "a 4 x 3 m bedroom, a door" and page.shown.scene is first
+        assert panel._chips.options == ("✓ a 4 x 3 m bedroom  ×", "✓ a door  ×")
+        panel.line.value = "4 x 3 m, a door in the north wall, no nightstand\n"
+        assert panel.line.value == "4 x 3 m, a door in the north wall, no nightstand"
+        assert {option[0] for option in panel._chips.options} == {"✓"} and not said
+        assert chip(panel, "door") == "✓ a door in the north wall  ×"
+        # Words that are not understood leave all as it is, and are said once.
         shown = page.shown
-        fields["want"].value = "a purple bed"
-        page.safely(lambda: panel.sample(page.source, 1, None))
-        assert "not understood: &#39;purple&#39;" in panel._wishes_text.content
-        assert page.shown is shown
-        request.clear()
-        assert request.asked() == {} and request.rest_text.visible is False
-        fields["ceiling_m"].value = "high"
-        with refused("viewer/ceiling_of_words"):
-            request.asked()
-        fields["ceiling_m"].value = "2.4 m"
-        assert request.asked() == {"ceiling_m": 2.4}
-        with refused("viewer/request_of_latents"):
-            page.source.sample(0, "paper", request.asked())
-        # A floor's file may be named on the command line, never in the browser.
-        (tmp_path / "floor.json").write_text("[[0, 0], [4, 0], [4, 3], [0, 3]]")
-        for text in (f"{tmp_path}/floor.json", f"{tmp_path}/floor.json:room", "floor.npz"):
-            fields["floor"].value = text
-            with refused("viewer/floor_of_a_file", text=text[:60]):
-                request.asked()
+        panel.line.value = "a purple bed\n"
+        assert page.shown is shown and len(said) == 1 and "not understood: 'purple'" in said[0]
+        page.undo()
+        assert (
+            "nightstand" not in panel.line.value
+            and page.shown.request.want == "a 4 x 3 m bedroom, a door"
+        )
+        page.undo()
+        assert panel.line.value == asked["want"] and page.shown.scene is first
+        with refused("viewer/nothing_to_undo"):
+            page.undo()
+        with refused("viewer/nothing_picked"):
+            panel.lock()
+        with refused("viewer/nothing_locked"):
+            panel.complete()
+
+
+def test_pieces_are_picked_locked_completed_and_replaced(prior):
+    with serving("127.0.0.1", 0) as server:
+        panel = open_page(server, Explorer(prior), "prior", asked={"want": "4 x 3 m, a bed"})
+        page = panel.page
+        page.pick(0)
+        assert page.shown.picked == 0 and panel._pieces.options[0] == "Lock this piece"
+        press(panel, panel._pieces, "Lock this piece")
+        assert page.shown.locked == {0} and panel._pieces.options[0] == "Unlock this piece"
+        bed = page.shown.scene.objects[0]
+        press(panel, panel._pieces, "Complete")
+        assert page.shown.scene.objects[0].center_m == bed.center_m and page.shown.picked is None
+        page.pick(1)
+        before = page.shown.scene
+        press(panel, panel._pieces, "Replace by model")
+        changed = [
+            a is not b for a, b in zip(page.shown.scene.objects, before.objects, strict=True)
+        ]
+        assert changed == [row == 1 for row in range(len(changed))]
+        press(panel, panel._pieces, "Undo")
+        assert page.shown.scene is before
+        panel.follows.value = False
+        panel.drop(1, 0.2, 0.0)
+        assert page.shown.locked == {0, 1} and page.shown.scene.objects[2:] == before.objects[2:]
+        press(panel, panel._pieces, "Undo")
+        panel.follows.value = True
+        panel.drop(1, 0.2, 0.0)
+        labels = [[item.label for item in scene.objects] for scene in (page.shown.scene, before)]
+        assert sorted(labels[0]) == sorted(labels[1]) and "2 locked pieces" in page.shown.origin
+        press(panel, panel._pieces, "Undo")
+        assert page.shown.scene is before  # one step, although the rest has followed
 
 
 @pytest.mark.parametrize("source", ["prior", "folder"])
-def test_values_that_the_page_does_not_offer_are_refused(prior, source, capfd):
+def test_values_that_the_page_does_not_offer_are_refused(prior, source, capfd, monkeypatch):
     """A client may send any value for any control."""
     room = Explorer(prior) if source == "prior" else Folder([ROOM, ROOM])
+    said = []
+    monkeypatch.setattr(Panel, "_said", lambda self: said.append)
     with serving("127.0.0.1", 0) as server:
         page = open_page(server, room, "mine").page
-        page.follow = page.safely
-        said = []
-        client = SimpleNamespace(add_notification=lambda *words, **_: said.append(words))
-        server.get_clients = lambda: {0: client}
-        tried = 0
+        page.follow = lambda task, tell=None: page.safely(task, tell)
+        event, tried = SimpleNamespace(client=SimpleNamespace(client_id=0)), 0
         for control in [*server.gui._gui_input_handle_from_uuid.values()]:
             most = getattr(control, "max", None)
             values = () if most is None else (control.min - 1, most + 1)
             for value in ("glb", "") if hasattr(control, "options") else values:
                 control._impl.value = value
-                said.clear()
                 for answer in control._impl.update_cb:
-                    answer(SimpleNamespace(client=client))
+                    answer(event)
                 tried += 1
             if getattr(control, "label", None) == "Download":
                 for answer in control._impl.update_cb:
-                    answer(SimpleNamespace(client=client))
-                answered = said[-1][1]
+                    answer(event)
+                answered = said[-1]
     assert answered.startswith("'' is not offered here; choose from GLB, JSON")
     assert tried > 5 and capfd.readouterr() == ("", "")
 
@@ -166,6 +214,9 @@ class FakeScene:
         self.added, self.nodes = [], {}
 
     def __getattr__(self, kind: str):
+        if not kind.startswith("add_"):
+            return MagicMock()
+
         def add(name: str, *values, **settings):
             self.added.append(name)
             self.nodes[name] = MagicMock(values=values, **settings)
@@ -180,78 +231,100 @@ def fake():
     return FakeScene()
 
 
-def drawn(fake: FakeScene, scene: Scene, shell: str, kept: tuple[int, ...] = (), **chosen: bool):
-    """The names of the nodes of a page's room."""
+def page_of(fake: FakeScene, scene: Scene, shell: str = "walls") -> pages.Page:
     server = SimpleNamespace(
         scene=fake, atomic=nullcontext, initial_camera=SimpleNamespace(), get_clients=dict,
         on_client_connect=lambda _: None,
     )  # fmt: skip
-    page = pages.Page(server, Folder([scene]), shell=shell)
-    page.display = Display(shell, **chosen)
-    page.show(replace(page.shown, kept=frozenset(kept)))
-    return {name.removeprefix("/room/") for name in fake.nodes} - {"+y"}
+    return pages.Page(server, Folder([scene]), shell=shell)
 
 
-def test_names_and_boxes_are_of_what_is_chosen_or_kept(fake):
+def drawn(fake: FakeScene, scene: Scene, shell: str, chosen=None, **state):
+    """The names of the nodes of a page's room."""
+    page = page_of(fake, scene, shell)
+    page.display = Display(shell, **chosen or {})
+    page.show(replace(page.shown, **state))
+    return {name.removeprefix("/room/") for name in fake.nodes} - {"/sky", "/sun"}
+
+
+def test_names_and_boxes_are_of_what_is_chosen_picked_or_locked(fake):
     lamp = SceneObject("pendant_lamp", (1.0, 2.0, 0.0), (0.4, 0.6, 0.4))
     room = Scene("room", "front3d_bedroom", (BED, lamp))
     objects = {"/grid", "object_0", "object_1"}
     assert drawn(fake, room, "none") == objects and fake.nodes["/grid"].visible
-    assert drawn(fake, room, "none", kept=(1,)) == objects | {"name_1", "box_1"}
+    assert drawn(fake, room, "none", picked=1) == objects | {"name_1", "box_1"}
     assert fake.nodes["/room/name_1"].values == ("pendant lamp 0.40 x 0.60 x 0.40 m",)
     assert len(fake.nodes["/room/box_1"].values[0]) == 12
+    fake = FakeScene()
+    assert drawn(fake, room, "none", locked=frozenset({0})) == objects | {"name_0", "box_0"}
+    assert fake.nodes["/room/name_0"].values[0].startswith("🔒 double bed")
     every = objects | {"name_0", "name_1", "box_0", "box_1"}
-    assert drawn(fake, room, "none", names=True, boxes=True) == every
-    assert drawn(FakeScene(), replace(room, objects=()), "none", names=True) == {"/grid"}
+    assert drawn(fake, room, "none", {"names": True, "boxes": True}) == every
+    assert drawn(FakeScene(), replace(room, objects=()), "none", {"names": True}) == {"/grid"}
 
 
-def test_of_walls_only_what_faces_the_room_is_drawn(fake):
-    drawn(fake, ROOM, "walls")
+def test_of_walls_towards_the_camera_outlines_and_openings_stay(fake):
+    names = drawn(fake, ROOM, "walls")
     walls = [fake.nodes[f"/room/wall_{row}"] for row in range(4)]
     assert all(node.side == "front" for node in walls) and not fake.nodes["/grid"].visible
-    for node, wall in zip(walls, shell_of(ROOM).walls, strict=True):
+    shell = shell_of(ROOM)
+    for node, wall in zip(walls, shell.walls, strict=True):
         # All faces lie in the plane of the inner face: no reveal of the door stays by itself.
         vertices, faces = node.values
         beyond = (vertices[faces][..., [0, 2]] - wall.start_m) @ wall.outward
         assert len(faces) and np.abs(beyond).max() < 1e-6
+    edges = fake.nodes["/room/edges"].values[0]
+    assert {tuple(point) for point in edges.reshape(-1, 3)[:, [0, 2]]} == {*map(tuple, FLOOR)}
+    (door,) = {name for name in names if name.endswith("_back")}
+    kind, front = door.startswith("door_"), fake.nodes[f"/room/{door.removesuffix('_back')}"]
+    ends_m = sorted(front.values[0][:, [0, 2]].tolist())
+    np.testing.assert_allclose(ends_m, [DOOR.start_m] * 2 + [DOOR.end_m] * 2, atol=1e-9)
+    assert kind
+    for node, sign in ((front, 1), (fake.nodes[f"/room/{door}"], -1)):  # it faces the room, or not
+        a, b, c = node.values[0][node.values[1][0]]
+        assert node.side == "front" and sign * np.cross(b - a, c - a)[2] > 0
     assert (fake.nodes["/room/ceiling"].values[0][:, 1] >= 2.6).all()
     assert drawn(FakeScene(), ROOM, "floor") == {"/grid", "floor", "object_0"}
 
 
-def test_a_ray_hits_the_board_where_a_dot_is(fake, torch_rng, rng):
-    cube = LatentCube(5)
-    latent_map = make_map(cube, cube(torch.randn(9, 5, generator=torch_rng)))
-    board = pages.Board(SimpleNamespace(scene=fake), latent_map, 4.0, lambda *_: None)
-    center_m = fake.nodes["/map"].position
-    dots_m = board.on_board(latent_map.rooms)
-    w, x, y, z = fake.nodes["/map"].wxyz  # by which viser turns the board
-    turn = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    np.testing.assert_allclose(board.in_scene(dots_m), dots_m @ turn.T + center_m, atol=1e-12)
-    for dot, place in zip(board.in_scene(dots_m), latent_map.rooms.tolist(), strict=True):
-        eye = rng.uniform([-3, 3, 3], [3, 6, 8])
-        np.testing.assert_allclose(board.hit(eye, 0.3 * (dot - eye)), place, atol=1e-6)  # float32
-    # Beside the board, its edge is hit; away from it, nothing.
-    beside = board.in_scene(np.array([[40.0, 0.0, 0.0]]))[0]
-    at_x, _ = board.hit(eye, beside - eye)
-    assert at_x == pytest.approx(latent_map.middle[0] + latent_map.side / 2)
-    assert board.hit(eye, eye - center_m) is None and board.hit(eye, [1.0, 0.0, 0.0]) is None
+def client_of(width: int, height: int) -> SimpleNamespace:
+    camera = SimpleNamespace(image_width=width, image_height=height, aspect=width / height)
+    return SimpleNamespace(client_id=0, camera=camera, atomic=nullcontext)
 
 
-def test_models_come_and_go():
-    with serving("127.0.0.1", 0) as server:
-        page = open_page(server, Folder([ROOM]), "rooms").page
-        page.display.models = True
-        page.show(page.shown)
-        assert page.scene.extra["retrieval"] and page.scene.objects[0].mesh is not None
-        page.display.models = False
-        page.show(page.shown)
-        assert page.scene.objects == ROOM.objects
+@pytest.mark.parametrize("view", views.VIEWS)
+@pytest.mark.parametrize("size", [(930, 796), (390, 844)])
+def test_views_show_the_room_above_the_drawer_of_a_phone(fake, view, size):
+    page, client = page_of(fake, ROOM), client_of(*size)
+    page.look(view, client)
+    camera = client.camera
+    matrix = look_at(camera.position, camera.look_at)
+    x, y, z = matrix[:3, :3] @ views.room_points(ROOM, True).T + matrix[:3, 3:]
+    slope = np.tan(camera.fov / 2)
+    if view == "Walk in":  # at the door, with the eyes inside the room
+        np.testing.assert_allclose(camera.position, [-0.05, views.EYE_M, -1.5 + views.STEP_M])
+        return
+    low = 1 if size[0] > 600 else 1 - 2 * views.DRAWER
+    assert (z > 0).all() and (abs(x) < slope * camera.aspect * z).all()
+    assert (y > -slope * z).all() and (y < low * slope * z).all()
+
+
+def test_a_dragged_piece_follows_the_pointer_on_the_floor(fake):
+    page, dropped = page_of(fake, ROOM), []
+    page.follow = lambda task: task()
+    page.on_drop = lambda *where: dropped.append(where)
+    eye, grabbed = np.array([0.0, 4.0, 5.0]), np.array([0.2, 1.0, 0.5])
+    drag = page._dragger(0)
+    for phase, to in (("start", grabbed), ("update", [0.7, 1.0, 0.0]), ("end", [0.7, 1.0, 0.0])):
+        way = np.asarray(to) - eye
+        client = SimpleNamespace(camera=SimpleNamespace(position=eye))
+        event = SimpleNamespace(
+            phase=phase, client=client, start_position=grabbed, end_position=eye + 0.4 * way
+        )
+        with contextlib.suppress(StopIteration):
+            drag(event).send(None)
+    np.testing.assert_allclose(fake.nodes["/room/object_0"].position, (0.5, 0, -0.5), atol=1e-9)
+    np.testing.assert_allclose(dropped, [(0, 0.5, -0.5)], atol=1e-9)
 
 
 def test_every_format_of_export_is_offered():
