@@ -6,9 +6,10 @@ import tempfile
 import time
 import traceback
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from gpu_parts import PAPER_ROOMS, Setup, changes_of, peak_mib, shards_of
@@ -131,7 +132,10 @@ def same_training(setup: Setup) -> None:
     `off` is the distance of the weights over the distance that they moved. The noise of float32 is
     its value for the same functions without graphs ('plain calls'), or in another order ('eager').
     """
-    few = ("data.workers=0", f"data.views_per_room={min(5, 2 * setup.sizes.rooms)}")
+    few: tuple[str, ...] = (
+        "data.workers=0",
+        f"data.views_per_room={min(5, 2 * setup.sizes.rooms)}",
+    )
     few += ("layout.epochs=1", "shape.epochs=1")
     ends: dict[str, dict[str, dict[str, Tensor]]] = {}
     for rate in (0.0, 0.1):
@@ -200,7 +204,6 @@ def _fit(
 @contextmanager
 def static_steps(device: str) -> Iterator[None]:
     """In a trial on a CPU, take the steps that are captured on a GPU, as plain calls."""
-    use_graphs = PaperStage.use_graphs
 
     def use(stage: PaperStage, trainer: Any) -> bool:
         if stage.stage.cuda_graphs:
@@ -209,12 +212,8 @@ def static_steps(device: str) -> Iterator[None]:
             )
         return stage.stage.cuda_graphs
 
-    if device == "cpu":
-        PaperStage.use_graphs = use
-    try:
+    with patch.object(PaperStage, "use_graphs", use) if device == "cpu" else nullcontext():
         yield
-    finally:
-        PaperStage.use_graphs = use_graphs
 
 
 @contextmanager

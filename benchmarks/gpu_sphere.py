@@ -91,7 +91,7 @@ class ReleasedLayout(LayoutDecoder):
     def __init__(self, width: int, classes: int):
         super().__init__(width, classes, "separate")
         self.stop = mlp(nn.Linear(width, width // 4), nn.Linear(width // 4, 1))
-        heads = self.mlp2
+        heads: Any = self.mlp2
 
         def outputs(shared: Tensor) -> Tensor:
             parts = [heads.classes(shared), *(head(shared) for head in heads.coordinates)]
@@ -110,11 +110,12 @@ def released_prior(config: Any, seed: int) -> ScenePrior:
     torch.manual_seed(seed)
     prior = ScenePrior(config.model, len(label_set(LABELS)), seed)
     prior.layout = ReleasedLayout(config.model.width, len(label_set(LABELS)))
-    steps = prior.decoder.output["mlps"]
+    decoder: Any = prior.decoder
+    steps = decoder.output["mlps"]
     for step in range(len(steps)):
         steps[step] = nn.Sequential(*steps[step], nn.ReLU())
     with torch.no_grad():
-        prior.decoder.start.normal_()
+        decoder.start.normal_()
     prior.shape.requires_grad_(False)
     prior.bevels.requires_grad_(False)
     return prior.train()
@@ -182,7 +183,7 @@ def train(path: Path, out: Path, count: int, until: float, device: str, seed: in
     torch.set_float32_matmul_precision("high")
     torch.set_num_threads(1)
     changes = (*RELEASED, f"layout.batch_size={batch}", *small)
-    config = load_config(str(find_config("bedroom.yaml")), changes)
+    config: Any = load_config(str(find_config("bedroom.yaml")), changes)
     rooms = Rooms(path, count, config.model.max_objects, device, seed)
     prior = released_prior(config, seed).to(device)
     latents = nn.Embedding(count, config.model.logits_per_room).to(device)

@@ -7,6 +7,7 @@ that the launches are the same in every step.
 """
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -133,7 +134,8 @@ class StaticStep:
 
     def _views(self, tensors: tuple[Tensor, ...]) -> SceneViews:
         assert self._template is not None, "prepare() comes first"
-        return replace(self._template, **dict(zip(_VIEWS, tensors, strict=True)))
+        named: dict[str, Any] = dict(zip(_VIEWS, tensors, strict=True))
+        return replace(self._template, **named)
 
 
 class _Layouts(nn.Module):

@@ -164,7 +164,8 @@ def _train(
         folder.mkdir(parents=True, exist_ok=True)
         remove_parts(folder)  # left by a process killed while saving
         dump_settings(config, folder.parent / "config.yaml")
-    with_graphs = hasattr(module, "use_graphs") and module.use_graphs(trainer)
+    use_graphs = getattr(module, "use_graphs", None)
+    with_graphs = use_graphs is not None and use_graphs(trainer)
     # With masks, worker processes may load the batches; for CUDA graphs, the host counts objects.
     if rooms.masks is None and not with_graphs:
         rooms.to(trainer.strategy.root_device)
