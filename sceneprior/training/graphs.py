@@ -3,10 +3,12 @@ that are copied to the host while the GPU goes on."""
 
 import warnings
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.func import functional_call
 
 from sceneprior.core.errors import InputWarning, cause_of
 
@@ -17,21 +19,31 @@ class Captured:
     """A function of tensors that, once `capture` was called, replays the work on the GPU.
 
     The tensors must then have the shapes of those given to `capture`, and the results are
-    overwritten by the next call. A step of the paper's network launches 2,000 kernels of 2
-    microseconds, and Python takes 20 for each; a graph launches all of them at once.
+    overwritten by the next call; a module's weights must stay where they are in memory. A step of
+    the paper's network launches 2,000 kernels of 2 microseconds, and Python takes 20 for each; a
+    graph launches all of them at once.
     """
 
     def __init__(self, name: str, function: Function):
-        self.name, self.function = name, function
+        self.name, self.function, self._weights = name, function, list[Tensor]()
+        if isinstance(function, nn.Module):
+            self._weights = [*function.parameters()]
+            names = [name for name, _ in function.named_parameters()]
+            self.function = partial(_with_weights, function, names)
 
     def __call__(self, *tensors: Tensor) -> Any:
-        return self.function(*tensors)
+        return self.function(*tensors, *self._weights)
 
     def capture(self, *tensors: Tensor) -> None:
         """Capture the function with tensors like these; if that fails, warn and keep the function
         as it is."""
         samples = tuple(
             tensor.detach().clone().requires_grad_(tensor.requires_grad) for tensor in tensors
+        )
+        # Weights are captured through other leaves that share their memory: theirs may belong to
+        # a graph of this step, on the stream of training, with which no capture may be mixed.
+        samples += tuple(
+            weight.detach().requires_grad_(weight.requires_grad) for weight in self._weights
         )
         try:
             self.function = captured(self.function, samples)
@@ -42,6 +54,12 @@ class Captured:
                 InputWarning,
                 stacklevel=2,
             )
+
+
+def _with_weights(module: nn.Module, names: list[str], *tensors: Tensor) -> Any:
+    """A module's results, its weights given after its inputs."""
+    inputs, weights = tensors[: -len(names)], tensors[-len(names) :]
+    return functional_call(module, dict(zip(names, weights, strict=True)), inputs)
 
 
 def captured(function: Function, samples: tuple[Tensor, ...]) -> Function:
