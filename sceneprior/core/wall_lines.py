@@ -164,11 +164,10 @@ def find_walls(
 
 
 def find_ceiling(
-    room: RoomViews, walls: Sequence[Wall], views: Sequence[int] | np.ndarray | None = None
+    room: RoomViews, walls: Sequence[Wall], views: Sequence[int] | np.ndarray
 ) -> float | None:
-    """Height in metres of the ceiling that `views` (None: all) of a room with `stuff` show: the
-    median height at which it meets its found walls. None if too few pixels show that."""
-    views = range(len(room.world_to_camera)) if views is None else views
+    """Height in metres of the ceiling that `views` of a room with `stuff` show: the median height
+    at which it meets its found walls. None if too few pixels show that."""
     found = [np.zeros(0)]
     for view in map(int, views) if walls else ():
         pose, K, pixels, _ = _borders(room, view, ON_CEILING, BARRIER)
@@ -180,9 +179,8 @@ def find_ceiling(
             along = (eye[::2] + reach[:, None] * rays[:, ::2] - start) @ (end - start)
             on = (reach > 0) & (along >= 0) & (along <= (end - start) @ (end - start))
             distances[on, row] = reach[on]
-        nearest = distances.min(axis=1)
-        met = np.isfinite(nearest)
-        found.append(eye[1] + nearest[met] * rays[met, 1])
+        heights_m = eye[1] + distances.min(axis=1) * rays[:, 1]
+        found.append(heights_m[np.isfinite(heights_m)])
     heights_m = np.concatenate(found)
     return float(np.median(heights_m)) if len(heights_m) >= _LEAST_POINTS else None
 
@@ -231,13 +229,12 @@ def on_floor(
 ]:
     """Points (x, z) at which the rays through pixels meet the plane y = `height_m`, the length in
     metres along the ray that one pixel covers there (inf for rays that do not meet it), and unit
-    vectors to the camera's place."""
+    vectors to below or above the camera."""
     eye = camera_centers(world_to_camera)
     focal = intrinsics[[0, 1], [0, 1]]
     rays = pixel_rays(pixels, world_to_camera, intrinsics)
     away = eye[1] - height_m
-    sideways = np.maximum(-rays[:, 1] * np.sign(away), 1e-9)
-    reach = rays[:, ::2] * (abs(away) / sideways)[:, None]
+    reach = rays[:, ::2] * (abs(away) / np.maximum(-rays[:, 1] * np.sign(away), 1e-9))[:, None]
     distance = np.linalg.norm(reach, axis=1)
     meets = rays[:, 1] * away < 0
     length = np.where(meets, (away**2 + distance**2) / max(abs(away), 1e-9) / focal.mean(), np.inf)
