@@ -41,7 +41,7 @@ MAY_TOO = {
 
 BUDGET = {
     "data_prep": (12805, 60),
-    "sceneprior/core": (5901, 28),
+    "sceneprior/core": (5898, 28),
     "sceneprior/furniture": (591, 4),
     "sceneprior/render": (4613, 23),
     "sceneprior/training": (1258, 7),
