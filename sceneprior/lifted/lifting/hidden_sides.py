@@ -71,7 +71,7 @@ def moved_to_planes(
             space_m = sides_m.copy()
             space_m[1 - end, axis] = sides_m[end, axis]
             space_m[end, axis] += outwards * gap_m
-            hull = carve(seen, *space_m, CELLS, reach=0.0, most_empty=1.0)
+            hull = carve(seen, space_m[0], space_m[1], CELLS, reach=0.0, most_empty=1.0)
             if (hull.emptiness <= EMPTY).mean() < HIDDEN:
                 continue
         at_wall |= axis != 1
