@@ -5,7 +5,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sceneprior.core.classes import label_set
+from sceneprior.apps.priors.packed import priors_that_draw
+from sceneprior.core.classes import UnknownClassError, label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
 from sceneprior.core.repeatable import check_seed, single_threaded
@@ -60,7 +61,12 @@ def sample_rooms(
                 "This run has no sampler, or its stage has not begun; leave out --distribution "
                 f"{SAMPLER}, or train with a section `sampler` (`--config lifted/bedroom.yaml`)."
             )
-        return sample_scenes(trained, names, seed, request, classes, completes, with_models)
+        try:
+            return sample_scenes(trained, names, seed, request, classes, completes, with_models)
+        except UnknownClassError as error:
+            if not (others := priors_that_draw(error.label)):
+                raise
+            raise InputError(f"{error} It is drawn by {' and '.join(others)}.") from None
     if request is not None or classes is not None:
         others = "these rooms come from latents"
         if not isinstance(trained, TrainedPrior):

@@ -104,8 +104,17 @@ def class_colors(count: int) -> np.ndarray:
     return colors
 
 
-def unknown_class(label: str, known: Sequence[str]) -> InputError:
-    """Error for a requested class that the training rooms of a run do not contain."""
-    return InputError(
-        f"'{label}' is not a class of this run's training rooms; choose from {', '.join(known)}."
-    )
+class UnknownClassError(InputError):
+    """A requested class that the training rooms of a run do not contain.
+
+    Args:
+        label: The requested class.
+        known: The run's classes.
+    """
+
+    def __init__(self, label: str, known: Sequence[str]):
+        super().__init__(
+            f"'{label}' is not a class of this run's training rooms; choose from "
+            f"{', '.join(known)}."
+        )
+        self.label = label

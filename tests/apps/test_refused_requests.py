@@ -73,6 +73,8 @@ ASKED: dict[str, dict[str, Any]] = {
     ),
     "relation_count": relation(subject="desk", relation="at a wall", count=0),
     "class_unknown": {"want": {"piano": 1}},
+    "class_of_another_prior": {"want": "a double bed and a wardrobe"},
+    "windows_twice": {"openings": "window@north", "want": "a window in the south wall"},
     "too_many_objects": {"want": {"chair": 60}},
     "given_too_many": {"want": {"double_bed": 1}, "objects": [box(), box(x=3.0)]},
     "contradiction": {

@@ -19,6 +19,8 @@ def meets(room: dict[str, Any], counts: list[tuple], relations: list[tuple], par
             to_room = target is None and _to_room(relation, one, room["floor_m"])
             fits = to_room or any(_related(relation, one, other) for other in others)
             found += one["class"] == subject and fits
+        if relation == "beside" and (subject, target, count) == ("nightstand", "double_bed", 2):
+            found = max((_pairs(items, bed) for bed in items if bed["class"] == target), default=0)
         good &= found >= count
     added = [o for o in room["objects"] if tuple(o["center_m"]) not in parts.get("given", [])]
     if (size := parts.get("size")) is not None:
@@ -71,6 +73,8 @@ def _related(relation: str, one: dict[str, Any], other: dict[str, Any]) -> bool:
     if relation == "in front of":
         return _before(other["yaw_rad"], x - to_x, z - to_z) and apart_m <= 3
     assert relation == "beside"
+    if other["class"] == "double_bed":
+        return any(_beside_bed(one, other).values())
     along_x = abs(math.sin(other["yaw_rad"])) > 0.5
     gaps = [
         abs(one["center_m"][a] - other["center_m"][a]) - (one["size_m"][a] + other["size_m"][a]) / 2
@@ -78,6 +82,41 @@ def _related(relation: str, one: dict[str, Any], other: dict[str, Any]) -> bool:
     ]
     along, across = gaps if along_x else gaps[::-1]
     return along < 0 and -0.05 <= across <= 0.5
+
+
+def _beside_bed(one: dict[str, Any], bed: dict[str, Any]) -> dict[tuple[int, int], bool]:
+    """Whether an object is beside a bed, at each end that may be its head (-1: the back), and on
+    each side."""
+    sine, cosine = round(math.sin(bed["yaw_rad"])), round(math.cos(bed["yaw_rad"]))
+    wide, _, deep = bed["size_m"] if cosine else bed["size_m"][::-1]
+    (x, _, z), (to_x, _, to_z) = one["center_m"], bed["center_m"]
+    ahead, across = (x - to_x) * sine + (z - to_z) * cosine, (x - to_x) * cosine - (z - to_z) * sine
+    own_wide, _, own_deep = one["size_m"] if cosine else one["size_m"][::-1]
+    ends = (-1,)
+    if deep <= wide:
+        ends, (ahead, across) = (-1, 1), (across, ahead)
+        (wide, deep), (own_wide, own_deep) = (deep, wide), (own_deep, own_wide)
+    # From the long side, which is a line, to the object.
+    to_line = max(abs(abs(across) - wide / 2) - own_wide / 2, 0)
+    beyond = max(abs(ahead) - deep / 2 - own_deep / 2, 0)
+    return {
+        (end, side): ahead * end > 0
+        and across * side > 0
+        and abs(abs(ahead) - deep / 2) <= 0.5
+        and math.hypot(to_line, beyond) <= 0.3
+        for end in ends
+        for side in (-1, 1)
+    }
+
+
+def _pairs(items: list[dict[str, Any]], bed: dict[str, Any]) -> int:
+    """2 if two nightstands flank the head of a bed, and 1 if one is beside it."""
+    beside = [_beside_bed(one, bed) for one in items if one["class"] == "nightstand"]
+    keys = [{key for key, holds in each.items() if holds} for each in beside]
+    return max(
+        (sum(any((end, side) in own for own in keys) for side in (-1, 1)) for end in (-1, 1)),
+        default=0,
+    )
 
 
 def _before(yaw_rad: float, x: float, z: float) -> bool:

@@ -243,6 +243,21 @@ def shipped_priors() -> dict[str, Path]:
     return {path.stem: path for path in sorted(Path(__file__).parent.glob("*.prior"))}
 
 
+def priors_that_draw(label: str) -> list[str]:
+    """The shipped priors whose samplers draw a class.
+
+    >>> priors_that_draw("wardrobe")[:1]
+    ['demo-bedroom']
+    """
+    names = []
+    for name, path in shipped_priors().items():
+        packed = read_packed(path)
+        drawn = packed.tensors["sampler.look_class"].unique().tolist()
+        if label in packed.said.classes and packed.said.classes.index(label) in drawn:
+            names.append(name)
+    return names
+
+
 def find_prior(where: str | Path) -> Path:
     """The file or folder of a prior: a path, which takes precedence; a name of `shipped_priors`; or
     `hf://OWNER/NAME`, which is downloaded once and kept in the Hub's cache."""

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from sceneprior.core.classes import label_set, unknown_class
+from sceneprior.core.classes import UnknownClassError, label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Mesh, Scene, SceneObject, Solid, quarter_turned
 from sceneprior.core.shell import rectangle
@@ -195,8 +195,12 @@ def _furnish(
         added = (plans.upcoming != END).any(dim=1)[particles.room]
         gaps = gaps_m(particles.rooms, plans.rectangle_m[particles.room])
         good = good & ~(added & (gaps.amax(dim=-1) > OPEN_M))
-    good = good.unflatten(0, (-1, effort.particles))
-    best = torch.arange(len(draws)) * effort.particles + good.int().argmax(dim=1)
+    merit = good.int()
+    if rules is not None:  # the room with the fewest faults
+        for row, own in enumerate(particles.furniture()):
+            merit[row] *= 100 - len(rules[int(particles.room[row])].faults(own))
+    good, merit = (part.unflatten(0, (-1, effort.particles)) for part in (good, merit))
+    best = torch.arange(len(draws)) * effort.particles + merit.argmax(dim=1)
     return particles, best.where(good.any(dim=1), -1), missing
 
 
@@ -241,7 +245,7 @@ def sample_scenes(
     if classes is not None:
         for label in classes:
             if label not in known:
-                raise unknown_class(label, known)
+                raise UnknownClassError(label, known)
         request = request or RoomRequest()
         whole = Counter(classes) + Counter(item.label for item in request.objects)
         want = {label: whole[label] for label in known}

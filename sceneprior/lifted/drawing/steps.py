@@ -3,7 +3,7 @@ partly furnished room."""
 
 from collections import Counter
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -162,7 +162,7 @@ def place_next(
     if not len(rows):
         return
     now, numbers = _Step(particles, rows, step), numbers[rows]
-    waiting = torch.arange(len(rows))
+    waiting, spare = torch.arange(len(rows)), dict[int, tuple[Tensor, Tensor]]()
     found = now.proposed(waiting, numbers[:, :3])
     x = (places := found.places()).draw_x(numbers[:, 3:].unflatten(1, (TRIES, 4))[..., :2])
     for number in range(TRIES):
@@ -179,9 +179,11 @@ def place_next(
                 allowed, reason = now.allowed(
                     int(waiting[at]), candidates.rows(one), rectangles_m[one], 1
                 )
+                fits[at] = bool(allowed[0]) and now.is_sound(int(waiting[at]), candidates.rows(one))
                 if not allowed[0]:
-                    fits[at] = False
                     rejections[int(own.label[at]), reason] += 1
+                elif not fits[at]:
+                    spare.setdefault(int(waiting[at]), (own.look[at], boxes_m[at]))
         particles.place(rows[waiting[fits]], own.label[fits], own.look[fits], boxes_m[fits])
         waiting = waiting[~fits]
         if not len(waiting):
@@ -193,6 +195,10 @@ def place_next(
         if reason := now.search(at, draws[int(now.room[at])]):
             rejections[int(now.label[at]), reason] += 1
         else:
+            particles.alive[rows[at]] = True
+    for at, (look, box_m) in spare.items():
+        if lost[now.room[at]] and not particles.alive[rows[at]]:
+            particles.place(rows[[at]], now.label[[at]], look[None], box_m[None])
             particles.alive[rows[at]] = True
 
 
@@ -210,6 +216,7 @@ class _Step:
         )
         self.logits = sampler.look_logits(self.state, self.label)
         self._furniture = [] if particles.rules is None else particles.furniture()
+        self._faults: dict[int, set[Any]] = {}
 
     def proposed(self, at: Int[Tensor, " some"], uniform: Float[Tensor, "some 3"]) -> Proposal:
         """Draw the look and the size of the next objects of some rows, and the rectangle in which
@@ -248,6 +255,17 @@ class _Step:
             int(self.label[at]), candidates, self._furniture[int(self.rows[at])], later,
             rectangles_m, enough,
         )  # fmt: skip
+
+    def is_sound(self, at: int, candidate: Furniture) -> bool:
+        """True if a place adds no fault to the room of row `at` (`PlacementRules.faults`)."""
+        assert self.particles.rules is not None
+        rules, placed = (
+            self.particles.rules[int(self.room[at])],
+            self._furniture[int(self.rows[at])],
+        )
+        if at not in self._faults:
+            self._faults[at] = rules.faults(placed)
+        return rules.faults(placed.joined(candidate)) <= self._faults[at]
 
     def search(self, at: int, draws: np.random.Generator) -> str:
         """Place a required object anywhere in a room; the reason if there is no allowed place.

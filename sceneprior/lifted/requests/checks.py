@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from sceneprior.core.classes import unknown_class
+from sceneprior.core.classes import UnknownClassError
 from sceneprior.core.errors import InputError, InputWarning
 from sceneprior.core.scene import Opening, Scene, SceneObject
 from sceneprior.core.scene_json import WALL_M
@@ -47,8 +47,10 @@ def check_request(
         own, count = asked.wishes.needs.get(label, []), there[label]
         least = max((need.least for need in own), default=0)
         if label not in (*known, *OPENINGS) and (least > count or not count):
-            raise unknown_class(label, known)
-        there_is = CountWish(label, count, said=f"{count} given {label}")
+            raise UnknownClassError(label, known)
+        names = [str(each) for each in asked.openings if isinstance(each, WantedOpening)]
+        named = ", ".join(name for name in names if name.startswith(label))
+        there_is = CountWish(label, count, said=named or f"{count} given {label}")
         for need, limit in product([*reversed(own), there_is], own):
             if limit.most is not None and need.least > limit.most:
                 raise _contradiction(

@@ -10,7 +10,7 @@ direction in which the bed faces.
 docs/requests.md lists the condition of each relation.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,14 +18,28 @@ import shapely
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from sceneprior.core.arrangements import (
+    AT_TABLE_M,
+    BACK_M,
+    BEDS,
+    OPENED,
+    Piece,
+    end_of_bed,
+    fronts,
+    heads,
+    squares_beside,
+)  # fmt: skip
+from sceneprior.core.scene import quarter_turned
 from sceneprior.core.shell import Wall
 from sceneprior.lifted.prototypes import PosedRooms
 from sceneprior.lifted.requests.floors import Floor, RoomShape
 from sceneprior.lifted.requests.wishes import OPENINGS, RelationWish
-from sceneprior.lifted.sampler.frames import OUTWARD, side_of
+from sceneprior.lifted.sampler.frames import GRAZE_M, OUTWARD, side_of
 from sceneprior.lifted.sampler.network import RoomSampler
 
 BESIDE_M = 0.5
+"""Largest distance of what is beside an object, or at its foot; beside a bed, that of
+`core/arrangements.py` applies."""
 NEAR_M = 1.0
 """InstructScene's threshold of "closely", applied to footprints in place of centres: the centres of
 a double bed and of a nightstand that touches it are 1.3 m apart."""
@@ -37,6 +51,10 @@ SECTOR_RAD = np.pi / 4
 """Half the angle of a sector."""
 REACH_M = 0.5
 """Maximum distance in front of a window at which an object may be `under` the window."""
+
+
+STAND_M = 0.4
+"""Width of floor that is kept free beside a bed for what stands there later."""
 
 
 class Furniture(NamedTuple):
@@ -55,6 +73,21 @@ class Furniture(NamedTuple):
     def rows(self, rows: np.ndarray | slice) -> "Furniture":
         """The objects of these rows."""
         return Furniture(*(part[rows] for part in self))
+
+    def pieces(self, classes: Sequence[str]) -> list[Piece]:
+        """The objects as the checks of function read them.
+
+        Args:
+            classes: Names of the classes by index; the names of others are empty.
+        """
+        found = []
+        for box, label, front in zip(
+            self.boxes_m.tolist(), self.object_class, self.front, strict=True
+        ):
+            quarters = round(float(np.arctan2(*front)) / (np.pi / 2)) % 4
+            name = classes[label] if 0 <= label < len(classes) else ""
+            found.append(Piece.of(name, box[:3], quarter_turned(box[3:], quarters)))
+        return found
 
     def joined(self, others: "Furniture") -> "Furniture":
         """These objects, followed by others."""
@@ -110,16 +143,26 @@ def related(
         return np.asarray(np.linalg.norm(gaps.clip(min=0), axis=-1) < NEAR_M)
     if relation == "far from":
         return np.asarray(distance > FAR_M)
-    if relation == "facing":
-        return _in_sector(-offset, subjects.front[:, None])
+    touches = np.linalg.norm(gaps.clip(min=0), axis=-1) <= AT_TABLE_M
+    if relation == "against":
+        return np.asarray(touches)
+    faces = _in_sector(-offset, subjects.front[:, None])
+    if relation in ("facing", "at"):
+        return faces & (touches | (relation == "facing"))
     front = np.broadcast_to(targets.front[None], offset.shape)
     if relation == "in front of":
         return _in_sector(offset, front) & (distance <= FAR_M)
+    if relation == "opposite":
+        return faces & _in_sector(offset, front)
     along = np.abs(front) > np.sin(SECTOR_RAD)  # the axis of the target's front
     level = np.where(along, gaps, -np.inf).max(axis=-1) < 0
     across = np.where(along, -np.inf, gaps).max(axis=-1)
     if relation == "beside":
         return np.asarray(level & (across >= -0.05) & (across <= BESIDE_M))
+    if relation == "at the foot of":
+        ahead = np.where(along, gaps, -np.inf).max(axis=-1)
+        before = (offset * front).sum(axis=-1) > 0
+        return np.asarray(before & (across < 0) & (ahead >= -0.05) & (ahead <= BESIDE_M))
     assert relation == "under", relation
     top = here[..., 1] + here[..., 4] / 2
     below = top <= there[..., 1] - there[..., 4] / 2 + 1e-3
@@ -141,10 +184,43 @@ def _in_sector(
     )
 
 
+def beside_bed(subjects: Furniture, bed: Piece) -> Float[np.ndarray, "subjects 2"]:
+    """The end of a bed, which may be its head, and the side at which each subject stands, as signs
+    (`end_of_bed`); zeros for subjects elsewhere."""
+    found = np.zeros((len(subjects.back), 2))
+    for row, piece in enumerate(subjects.pieces(())):
+        place = end_of_bed(bed, piece)
+        if place is not None and place[0] in heads(bed):
+            found[row] = place
+    return found
+
+
+def on_sides(subjects: Furniture, targets: Furniture, label: str) -> Iterator[np.ndarray]:
+    """Places beside a target, for each target and each two sides of it between which subjects can
+    be: -1 or 1 for subjects at these sides, 0 for others. A table has two such pairs of sides, and
+    a bed one at each end that may be its head."""
+    for row in range(len(targets.back)):
+        target = targets.rows(slice(row, row + 1))
+        if label in BEDS:
+            places = beside_bed(subjects, target.pieces((label,))[0])
+            for end in (-1, 1):
+                yield np.where(places[:, 0] == end, places[:, 1], 0)
+            continue
+        for turned in (False, True)[: 1 + label.endswith("table")]:
+            front = target.front[:, ::-1] if turned else target.front
+            own = target._replace(front=front)
+            across = np.array([front[0, 1], -front[0, 0]])
+            side = np.sign((subjects.boxes_m - own.boxes_m)[:, [0, 2]] @ across)
+            yield side * related("beside", subjects, own, label)[:, 0]
+
+
 def related_to_room(
     relation: str, subjects: Furniture, floor: Floor
 ) -> Bool[np.ndarray, " subjects"]:
-    """True for subjects for which a relation of `TO_ROOM` holds."""
+    """True for subjects that stand at a wall, in a corner, or with their back to a wall."""
+    if relation == "back to a wall":
+        walls = (floor.polygon.exterior,)
+        return np.array([each.back_gap_m(walls) <= BACK_M for each in subjects.pieces(())], bool)
     if relation == "at a wall":
         walls, least = floor.polygon.exterior, AT_WALL_M
     else:
@@ -176,16 +252,23 @@ class RelationChecks:
         wishes: The requested relations.
         shape: Floor, doors and windows.
         classes: Names of the classes by index.
+        blocked: Floor where nothing may stand, such as that where a door swings.
     """
 
-    def __init__(self, wishes: Sequence[RelationWish], shape: RoomShape, classes: Sequence[str]):
-        self.wishes, self.shape, self.classes = wishes, shape, classes
+    def __init__(
+        self,
+        wishes: Sequence[RelationWish],
+        shape: RoomShape,
+        classes: Sequence[str],
+        blocked: Sequence[shapely.Polygon] = (),
+    ):
+        self.wishes, self.shape, self.classes, self.blocked = wishes, shape, classes, blocked
         self.index: dict[str | None, int] = {name: row for row, name in enumerate(classes)}
         self.openings = {kind: opening_items(shape, kind) for kind in OPENINGS}
 
     def held(self, furniture: Furniture) -> list[bool]:
         """True for each relation that holds in a furnished room."""
-        return [int(self._met(wish, furniture).sum()) >= wish.count for wish in self.wishes]
+        return [self._number(wish, furniture) >= wish.count for wish in self.wishes]
 
     def can_hold(
         self, label: int, candidates: Furniture, placed: Furniture, upcoming: Sequence[int]
@@ -194,28 +277,83 @@ class RelationChecks:
         possible. Upcoming objects are assumed to find places in which their relations hold."""
         possible = np.ones(len(candidates.back), dtype=bool)
         name = self.classes[label]
+        later = [self.classes[index] for index in upcoming]
         for wish in self.wishes:
-            if name not in (wish.subject, wish.target):
+            at_bed = wish.relation in ("beside", "on both sides of") and wish.target in BEDS
+            named = name in (wish.subject, wish.target) or at_bed or _needs_free_front(wish)
+            if not named or wish.target in later:
                 continue
-            later = [self.classes[index] for index in upcoming]
-            if wish.target in later:
-                continue
-            needed = wish.count - later.count(wish.subject)
+            coming = later.count(wish.subject)
             for row in np.flatnonzero(possible):
                 joined = placed.joined(candidates.rows(slice(row, row + 1)))
-                possible[row] = self._met(wish, joined).sum() >= needed
+                most = min(coming, self._free_sides(wish, joined)) if at_bed and coming else coming
+                possible[row] = self._number(wish, joined) + most >= wish.count
         return possible
 
-    def _met(self, wish: RelationWish, furniture: Furniture) -> Bool[np.ndarray, " subjects"]:
-        """True for each object of the subject's class for which the relation holds."""
+    def _free_sides(self, wish: RelationWish, furniture: Furniture) -> int:
+        """The largest number of subjects that still find a place beside a bed."""
+        pieces, most = furniture.pieces(self.classes), 0
+        for bed in pieces:
+            if bed.label != wish.target:
+                continue
+            taken = [p.place for p in pieces if p is not bed and p.standing] + [*self.blocked]
+            free = [
+                end
+                for (end, _), square in squares_beside(bed, STAND_M).items()
+                if self.shape.floor.polygon.covers(square.buffer(-GRAZE_M))
+                and not any(square.intersects(place) for place in taken)
+            ]
+            most = max([most, *(free.count(end) for end in free)])
+        return most if wish.count <= 2 else len(furniture.back)
+
+    def _number(self, wish: RelationWish, furniture: Furniture) -> int:
+        """The number of objects of the subject's class for which the relation holds."""
         subjects, targets = (
             furniture.rows(furniture.object_class == self.index.get(label, -2))
             for label in (wish.subject, wish.target)
         )
         if wish.target is None:
-            return related_to_room(wish.relation, subjects, self.shape.floor)
-        targets = self.openings.get(wish.target, targets)
-        found = related(wish.relation, subjects, targets, wish.target)
+            return int(self._related_to_room(wish, subjects, furniture).sum())
+        targets, label = self.openings.get(wish.target, targets), wish.target
+        if wish.relation == "on both sides of":
+            half = (wish.count + 1) // 2
+            numbers = [
+                min(half, (side < 0).sum()) + min(half, (side > 0).sum())
+                for side in on_sides(subjects, targets, label)
+            ]
+            return int(max(numbers, default=0))
+        if wish.relation == "beside" and label in BEDS:
+            beds = targets.pieces(self.classes)
+            found = np.array([beside_bed(subjects, bed)[:, 0] != 0 for bed in beds]).T
+            found = found.reshape(len(subjects.back), len(beds))
+        else:
+            found = related(wish.relation, subjects, targets, label)
         if wish.subject == wish.target:
             found &= ~np.eye(len(found), dtype=bool)
-        return np.asarray(found.any(axis=1))
+        return int(found.any(axis=1).sum())
+
+    def _related_to_room(
+        self, wish: RelationWish, subjects: Furniture, furniture: Furniture
+    ) -> Bool[np.ndarray, " subjects"]:
+        """True for subjects for which a relation of `TO_ROOM` holds. Classes that are used from
+        their front are at a wall if their back is at it and the floor before them is free."""
+        floor, found = self.shape.floor, np.ones(len(subjects.back), dtype=bool)
+        if wish.relation != "with a free front":
+            found = related_to_room(wish.relation, subjects, floor)
+            if wish.subject in OPENED and wish.relation == "at a wall":
+                found = related_to_room("back to a wall", subjects, floor)
+        if not _needs_free_front(wish):
+            return found
+        pieces = furniture.pieces(self.classes)
+        rows = np.flatnonzero(furniture.object_class == self.index[wish.subject])
+        usable = [True] * len(pieces)
+        for outcomes in fronts(pieces, floor.polygon).values():
+            for each in outcomes:
+                usable[each.rows[0]] &= each.holds
+        return found & np.array(usable, dtype=bool)[rows]
+
+
+def _needs_free_front(wish: RelationWish) -> bool:
+    return wish.relation == "with a free front" or (
+        wish.relation == "at a wall" and wish.subject in OPENED
+    )

@@ -9,6 +9,14 @@ import numpy as np
 import shapely
 from jaxtyping import Bool, Float, Int
 
+from sceneprior.core.arrangements import (
+    BEDS,
+    NIGHTSTANDS,
+    end_of_bed,
+    findings,
+    heads,
+    rows_of,
+)
 from sceneprior.core.shell import space_before
 from sceneprior.lifted.requests.floors import RoomShape
 from sceneprior.lifted.requests.relations import Furniture, RelationChecks, footprints
@@ -36,6 +44,12 @@ BEFORE_WINDOW_M = 0.4
 """Depth of the floor in front of a window where objects must not be higher than the sill."""
 BEFORE_WINDOWS = ("lamp", "plant")
 """Words in the names of classes that may stand or hang in front of a window."""
+
+FAULTS = (
+    "pairs_at_bed", "chairs_at_tables", "chairs_turned", "screens_seen", "fronts_free",
+    "backs_covered",
+)  # fmt: skip
+"""Checks of function that places should not fail."""
 
 
 class Zone(NamedTuple):
@@ -77,8 +91,9 @@ class PlacementRules:
         given: Furniture,
     ):
         self.shape, self.classes = shape, classes
-        self.relations = RelationChecks(wishes, shape, classes)
         self._zones = zones_of(shape)
+        swings = [zone.polygon for zone in self._zones["door"]]
+        self.relations = RelationChecks(wishes, shape, classes, swings)
         self._needs_access = needs_access(classes)
         has_door = any(each.kind == "door" for each in shape.openings)
         self._paths = Paths(shape) if has_door else None
@@ -126,6 +141,26 @@ class PlacementRules:
                 reason = reason or "a path from a door"
             enough -= int(allowed[row])
         return allowed, reason
+
+    def faults(self, furniture: Furniture) -> set[tuple[str, tuple[int, ...]]]:
+        """The checks of function that fail in a partly furnished room, with the rows of the objects
+        that they are about. What objects to come may mend is none."""
+        pieces = furniture.pieces(self.classes)
+        found = findings(pieces, self.shape.floor.polygon)
+        failed = {
+            (check, each.rows)
+            for check in FAULTS
+            for each in found.get(check, [])
+            if not each.holds
+        }
+        beds = rows_of(pieces, BEDS)
+        if len(beds) == 1:
+            bed = pieces[beds[0]]
+            for row in rows_of(pieces, NIGHTSTANDS):
+                place = end_of_bed(bed, pieces[row])
+                if place is None or place[0] not in heads(bed):
+                    failed.add(("beside the head", (row,)))
+        return failed
 
     def _all_reached(self, furniture: Furniture) -> bool:
         """True if a path leads to every object, but for given ones that had none from the start."""

@@ -9,13 +9,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from sceneprior.core.arrangements import BEDS, CHAIRS, TABLES
+from sceneprior.core.classes import LABEL_SETS
 from sceneprior.core.errors import InputError
 from sceneprior.lifted.requests.vocabulary import (
     BOUNDS,
+    ENDS,
     FILLERS,
+    INVERTED_WORDS,
     NOUNS,
     NUMBERS,
     RELATION_WORDS,
+    RELATIONS_TO_IT,
     ROOM_WORDS,
     ROOMS,
     WALL_WORDS,
@@ -26,6 +31,7 @@ from sceneprior.lifted.requests.wishes import (
     RelationWish,
     Wishes,
     count_of,
+    meant_relation,
 )  # fmt: skip
 
 LONGEST = 2000
@@ -67,14 +73,15 @@ def read_sentence(text: str, known: Sequence[str], label_set: str) -> Sentence:
         raise InputError(
             f"The request has a number below 0 ('{negative[0]}'); numbers and sizes are above 0."
         )
-    lowered = text.lower().replace("-", " ")
+    lowered = re.sub("['’]s\\b", " 's", text.lower().replace("-", " "))
     sizes = _SIZE.findall(lowered)
     if len(sizes) > 1:
         raise InputError(f"The request names {len(sizes)} sizes of floors; expected one.")
     rest = _SIZE.sub(f" {_SIZE_TOKEN} ", lowered.replace(_SIZE_TOKEN, "?"))
     if (length := _LENGTH.search(rest)) is not None:
         raise _other_length(length[0])
-    reader = _Reader(_lex(_TOKEN.findall(rest), _meanings(known)), label_set)
+    meanings = _meanings(known)
+    reader = _Reader(_lex(_TOKEN.findall(rest), meanings), label_set, meanings["bed"][1][1])
     if reader.strange:
         # If another word is unknown, words before a noun are left out: usually it is their noun.
         fine = {"a", "an", "the", *RELATION_WORDS, *NUMBERS, *" ".join(BOUNDS).split()}
@@ -85,8 +92,8 @@ def read_sentence(text: str, known: Sequence[str], label_set: str) -> Sentence:
         raise InputError(
             f"The request has words that are not understood: {words}. It may name numbers, doors, "
             f"windows, the classes {', '.join(name.replace('_', ' ') for name in known)}, and "
-            "relations such as beside, in front of, facing, against a wall, in a corner, under, "
-            "near and far from; leave out the rest."
+            "relations such as beside, on each side of, at the foot of, in front of, facing, "
+            "opposite, against a wall, in a corner, under, near and far from; leave out the rest."
         )
     floor = "x".join(sizes[0]) if sizes else None
     return Sentence(reader.wishes(), floor, reader.openings)
@@ -109,8 +116,9 @@ class _Token(NamedTuple):
 
 def _meanings(known: Sequence[str]) -> dict[str, tuple[str, Any]]:
     """The kind and the value of each phrase; later entries override earlier ones."""
-    nouns: dict[str, tuple[str, ...]] = {name.replace("_", " "): (name,) for name in known}
+    nouns = {name.replace("_", " "): (name,) for names in LABEL_SETS.values() for name in names[1:]}
     nouns |= {noun: classes for noun, classes in NOUNS.items() if noun not in known}
+    nouns |= {name.replace("_", " "): (name,) for name in known}
     nouns |= {opening: (opening,) for opening in OPENINGS}
     labels = {
         noun: next((name for name in classes if name in known), classes[0])
@@ -126,13 +134,17 @@ def _meanings(known: Sequence[str]) -> dict[str, tuple[str, Any]]:
         | {word: ("before a room", None) for word in ("in", "for", "of")}
         | {word: ("pronoun", None) for word in ("it", "them")}
         | {"the": ("the", None), "some": ("some", None), "any": ("some", None)}
-        | {noun: ("noun", (False, label)) for noun, label in labels.items()}
+        | {"its": ("possessive", None), "their": ("possessive", None), "'s": ("'s", None)}
         | {noun: ("noun", (True, label)) for noun, label in plurals.items()}
+        | {noun: ("noun", (False, label)) for noun, label in labels.items()}
         | {room: ("room", ends) for room, ends in ROOMS.items()}
         | {word: ("number", number) for word, number in NUMBERS.items()}
         | {word: ("bound", sign) for word, sign in BOUNDS.items()}
         | {word: ("relation", relation) for word, relation in RELATION_WORDS.items()}
+        | {word: ("relation to it", relation) for word, relation in RELATIONS_TO_IT.items()}
+        | {word: ("inverted relation", relation) for word, relation in INVERTED_WORDS.items()}
         | {word: ("relation to the room", relation) for word, relation in ROOM_WORDS.items()}
+        | {word: ("end of a bed", end) for word, end in ENDS.items()}
         | {word: ("wall", wall) for word, wall in WALL_WORDS.items()}
     )
 
@@ -170,10 +182,10 @@ class _Group:
 
 class _Reader:
     """Reads tokens from left to right; `strange` collects words without a meaning where they
-    stand."""
+    stand. `bed` is the class that "bed" means."""
 
-    def __init__(self, tokens: list[_Token], label_set: str):
-        self.tokens, self.label_set = [*tokens, _Token("", "end")], label_set
+    def __init__(self, tokens: list[_Token], label_set: str, bed: str):
+        self.tokens, self.label_set, self.bed = [*tokens, _Token("", "end")], label_set, bed
         self.strange: list[str] = []
         self.openings: list[str] = []
         self.groups: list[_Group] = []
@@ -237,23 +249,80 @@ class _Reader:
 
     def _relation(self) -> bool:
         """Read a relation of the last group, if one comes next."""
-        subject, token = self.subject, self._next("relation", "relation to the room")
+        # "Two nightstands, one on each side" are two.
+        self.at += self.tokens[self.at].text in ("one", "each") and self._is_to_sides(self.at + 1)
+        subject, start = self.subject, self.at
+        token = self._next(
+            "relation", "relation to it", "inverted relation", "relation to the room"
+        )
         if token is None:
             return False
+        relation, target = token.value, None
+        if token.kind == "relation":
+            relation, target = self._end_and_target(relation)
+        elif token.kind == "relation to it":
+            target = self._named_before()
+        elif token.kind == "inverted relation":
+            target, others = subject.noun if subject else None, self._group()
+            self.subject = subject
+            subject = others if others is not None and others.number > 1 else None
         to_room = token.kind == "relation to the room"
-        target = None if to_room else self._target()
         if subject is None or (not to_room and (target is None or subject.noun in OPENINGS)):
             self.strange.append(token.text)
             return True
-        self.subject, count = subject, 1 if subject.sign == "<=" else max(subject.number, 1)
-        self.relations.append(RelationWish(subject.noun, token.value, target, count))
+        if token.kind != "inverted relation":
+            self.subject = subject
+        if relation == "on both sides of" and subject.number:
+            twice = subject.counted and "each" in token.text and target not in BEDS
+            subject.number = max(2, subject.number * (2 if twice else 1))
+            subject.said += "".join(f" {each.text}" for each in self.tokens[start : self.at])
+        if relation == "at" and not (subject.noun in CHAIRS and target in TABLES):
+            relation = "near"
+        count = 1 if subject.sign == "<=" else max(subject.number, 1)
+        self.relations.append(meant_relation(subject.noun, relation, target, count))
         return True
+
+    def _is_to_sides(self, at: int) -> bool:
+        """True if the token at this place begins a relation to both sides of an object."""
+        return self.tokens[min(at, len(self.tokens) - 1)].value == "on both sides of"
+
+    def _end_and_target(self, relation: str) -> tuple[str, str | None]:
+        """Read the target of a relation, or an end of a bed: "the bed", "the head of the bed", "the
+        bed's head", "its headboard"; the relation to this end, and the target."""
+        target, end = None, self._end()
+        if end is None:
+            target = self._target()
+            end = self._end() if target and self._next("'s") else None
+        elif self.tokens[self.at].text == "of":
+            self.at += 1
+            target = self._target()
+        else:
+            target = self._named_before(bed=True)
+        if end and relation in ("beside", "near", "at", "against", "on"):
+            return "beside" if end == "head" else "at the foot of", target
+        no_place = relation == "on" or (relation == "on both sides of" and end == "foot")
+        return relation, None if no_place else target
+
+    def _end(self) -> str | None:
+        """Read an end of a bed: `head` or `foot`."""
+        start = self.at
+        self.at += self.tokens[start].text in ("the", "its", "their", "a", "one")
+        if (token := self._next("end of a bed")) is None:
+            self.at = start
+            return None
+        return str(token.value)
+
+    def _named_before(self, bed: bool = False) -> str | None:
+        """The last noun before the subject that is another one; of a bed, if asked."""
+        others = [g.noun for g in self.groups if self.subject and g.noun != self.subject.noun]
+        if bed:
+            others = [noun for noun in others if noun in BEDS] or [self.bed]
+        return others[-1] if others else None
 
     def _target(self) -> str | None:
         """Read the target of a relation: a class, `door` or `window`."""
         if self._next("pronoun") is not None:
-            others = [g.noun for g in self.groups if self.subject and g.noun != self.subject.noun]
-            return others[-1] if others else None
+            return self._named_before()
         group = self._group()
         return None if group is None else group.noun
 

@@ -21,30 +21,66 @@ NOUNS: dict[str, tuple[str, ...]] = {
     "refrigerator": ("refridgerator",), "tv": ("television",), "tub": ("bathtub",),
 }  # fmt: skip
 """Classes that a noun may mean; the first class that the prior draws is used."""
+_SIDES = [
+    f"{word} {sides}"
+    for sides in ("each side", "either side", "both sides", "its two sides", "the two sides",
+                  "its sides", "opposite sides")
+    for word in ("on", "at", "to")
+]  # fmt: skip
 RELATION_WORDS = {
-    "beside": "beside", "next to": "beside", "at the side of": "beside", "alongside": "beside",
+    "beside": "beside", "next to": "beside", "alongside": "beside", "adjacent to": "beside",
+    "at the side of": "beside", "on one side of": "beside", "to one side of": "beside",
+    **{f"{words} of": "on both sides of" for words in _SIDES},
+    **{f"{end}{word}": "on both sides of"
+       for word in ("flanking", "flank", "framing") for end in ("", "that ", "which ")},
     "in front of": "in front of", "before": "in front of", "facing": "facing",
     "that faces": "facing", "which faces": "facing", "that face": "facing", "face": "facing",
-    "faces": "facing", "looking at": "facing", "at": "near", "under": "under",
+    "faces": "facing", "looking at": "facing", "turned to": "facing", "turned towards": "facing",
+    "opposite": "opposite", "opposite to": "opposite", "opposite of": "opposite",
+    "across from": "opposite", "at": "at", "around": "at", "against": "against",
+    "up against": "against", "touching": "against", "under": "under",
     "below": "under", "beneath": "under", "underneath": "under", "near": "near", "near to": "near",
     "close to": "near", "by": "near", "far from": "far from", "far away from": "far from",
-    "away from": "far from",
+    "away from": "far from", "on": "on", "to": "on",
 }  # fmt: skip
-"""Relations to an object, a door or a window."""
-ROOM_WORDS = {
-    f"{word} {article} {noun}": relation
-    for noun, relation, words in (
-        ("wall", "at a wall", ("at", "against", "along", "on", "by")),
-        ("corner", "in a corner", ("in", "at")),
-    )
-    for word in words
-    for article in ("a", "the", "one")
-}
+"""Relations to an object, a door or a window; `on` is one only with an end of a bed."""
+RELATIONS_TO_IT = dict.fromkeys(_SIDES, "on both sides of")
+"""Relations to the object named before."""
+INVERTED_WORDS = {"flanked by": "on both sides of", "framed by": "on both sides of",
+                  "between": "on both sides of"}  # fmt: skip
+"""Relations of the objects that follow to the object before: "a bed between two nightstands"."""
+ENDS = {
+    **dict.fromkeys(("head", "headboard", "head end", "head side", "headboard end",
+                     "headboard side", "bedhead"), "head"),
+    **dict.fromkeys(("foot", "footboard", "foot end", "foot side", "footboard end", "end"), "foot"),
+}  # fmt: skip
+"""Words for the two ends of a bed."""
+ROOM_WORDS = (
+    {
+        f"{word} {article}{noun}": relation
+        for noun, relation, words in (
+            ("wall", "at a wall", ("at", "against", "along", "on", "by", "to", "up against")),
+            ("walls", "at a wall", ("at", "against", "along", "on", "by")),
+            ("corner", "in a corner", ("in", "at")),
+        )
+        for word in words
+        for article in ("a ", "the ", "one ", "")
+    }
+    | {
+        f"{start}{side}{end} {word} {article} wall": "back to a wall"
+        for start in ("with its ", "with the ", "with their ", "its ", "their ", "")
+        for side in ("back", "head", "headboard")
+        for end in ("", "s")
+        for word in ("to", "against", "at", "on", "along")
+        for article in ("a", "the", "one")
+    }
+    | {words: words for words in ("with a free front",)}
+)
 """Relations to the room."""
 NUMBERS = {
     "no": 0, "zero": 0, "without": 0, "a": 1, "an": 1, "one": 1, "another": 1, "two": 2, "three": 3,
     "four": 4, "five": 5, "six": 6, "seven": 7, "eight": 8, "nine": 9, "ten": 10, "eleven": 11,
-    "twelve": 12,
+    "twelve": 12, "a pair of": 2, "a couple of": 2,
 }  # fmt: skip
 BOUNDS = {"at least": ">=", "at most": "<=", "no more than": "<=", "no fewer than": ">=",
           "up to": "<=", "exactly": ""}  # fmt: skip

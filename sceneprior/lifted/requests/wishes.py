@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
+from sceneprior.core.arrangements import BEDS, NIGHTSTANDS
 from sceneprior.core.checked import plain, shown
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Opening, SceneObject
@@ -16,11 +17,17 @@ from sceneprior.core.scene_json import MOST_OBJECTS
 from sceneprior.lifted.requests.floors import Floor
 from sceneprior.lifted.requests.openings import WantedOpening
 
-TO_ROOM = ("at a wall", "in a corner")
+TO_ROOM = ("at a wall", "in a corner", "back to a wall", "with a free front")
 """Relations to the room, which have no target."""
-TO_TARGET = ("beside", "in front of", "facing", "under", "near", "far from")
+TO_TARGET = (
+    "beside", "on both sides of", "at the foot of", "at", "against", "opposite", "in front of",
+    "facing", "under", "near", "far from",
+)  # fmt: skip
 """Relations to another object, a door or a window."""
-BY_FRONT = ("beside", "in front of", "facing")
+BY_FRONT = (
+    "beside", "on both sides of", "at the foot of", "at", "opposite", "in front of", "facing",
+    "back to a wall", "with a free front",
+)  # fmt: skip
 """Relations that depend on the front of an object."""
 RELATIONS = (*TO_TARGET, *TO_ROOM)
 OPENINGS = ("door", "window")
@@ -233,6 +240,14 @@ def relation_wish(entry: Mapping[str, Any]) -> RelationWish:
             f"A relation has count {shown(count)}; expected a whole number from 1 to "
             f"{MOST_OBJECTS}."
         )
+    named = None if target is None else plain(str(target))
+    return meant_relation(subject, str(relation), named, count)
+
+
+def meant_relation(subject: str, relation: str, target: str | None, count: int) -> RelationWish:
+    """A relation as people mean it: two nightstands beside a bed stand on its two sides."""
+    if relation == "beside" and target in BEDS and subject in NIGHTSTANDS and count == 2:
+        relation = "on both sides of"
     return RelationWish(
-        subject, str(relation), None if target is None else plain(str(target)), count
+        subject, relation, target, max(count, 2) if relation == "on both sides of" else count
     )

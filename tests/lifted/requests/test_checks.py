@@ -62,6 +62,8 @@ def sentences(draw: st.DrawFn) -> tuple[str, list[tuple], list[tuple]]:
             target = draw(st.sampled_from(CLASSES if fronted else CLASSES + OPENINGS))
             phrases[-1] += f" the {target.replace('_', ' ')}"
             counts.append((target, 1, math.inf))
+        if relation == "beside" and (label, target) == ("nightstand", "double_bed"):
+            event("nightstands beside a bed")
         needed = 1 if form == "at most" else 1 if form == "the" else max(number, 1)
         relations.append((label, relation, target, needed))
     counts += [(label, number, number) for label, number in exact.items()]

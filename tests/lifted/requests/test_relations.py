@@ -1,8 +1,11 @@
 """Relations at places where they barely hold and barely fail, and in partly furnished rooms."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 
+from sceneprior.core.arrangements import findings
 from sceneprior.core.scene import Opening
 from sceneprior.lifted.requests.floors import Floor, RoomShape, read_floor
 from sceneprior.lifted.requests.relations import (
@@ -97,12 +100,87 @@ def test_a_wish_can_hold_while_objects_come_that_may_meet_it():
         boxes = np.array([row for _, row in each]).reshape(-1, 6)
         return furniture(boxes, np.zeros(len(each), int), [label for label, _ in each])
 
-    near, far = at(1.2, -3.0), at(3.5, 3.0)
+    near, far = at(1.2, -3.7), at(3.5, 3.0)
     both = placed((2, near), (2, far))
     bed = placed((1, BED))
     assert relations.can_hold(2, both, bed, [2]).tolist() == [True, False]
     assert relations.can_hold(2, both, bed, [2, 2]).tolist() == [True, True]
     assert relations.can_hold(2, both, placed(), [2, 1]).tolist() == [True, True]
+    assert relations.held(placed((1, BED), (2, near), (2, at(1.2, -3.6)))) == [True]
     assert relations.can_hold(3, placed((3, far)), bed, [2]).tolist() == [True]
-    assert relations.held(placed((1, BED), (2, near), (2, at(-1.2, -3.0)))) == [True]
+    assert relations.held(placed((1, BED), (2, near), (2, at(-1.2, -3.7)))) == [True]
+    assert relations.held(placed((1, BED), (2, near), (2, at(-1.2, -2.3)))) == [False]
     assert relations.held(placed((1, BED), (2, near), (2, far))) == [False]
+
+
+def held(relation: str, subject: str, target: str | None, *placed: tuple, count: int = 1) -> bool:
+    """A relation of a room on `FLOOR` with objects (label, back, box)."""
+    classes = ("void", "bed", "nightstand", "wardrobe", "table", "chair", "sofa")
+    boxes = np.array([box for _, _, box in placed])
+    labels = [classes.index(label) for label, _, _ in placed]
+    own = furniture(boxes, np.array([back for _, back, _ in placed]), labels)
+    wish = RelationWish(subject, relation, target, count)
+    return RelationChecks([wish], RoomShape(Floor(read_floor(FLOOR))), classes).held(own)[0]
+
+
+def test_pairs_at_a_head_are_the_yardsticks_pairs():
+    """Two nightstands anywhere about a bed that faces high z."""
+    xs, zs = (-1.6, -1.2, 1.2, 1.45, 1.5), (-3.95, -3.55, -3.45, -3.0, -2.0)
+    places, seen = list(product(xs, zs)), set()
+    for one, other in product(places, places):
+        room = [("bed", 0, BED), *(("nightstand", 0, at(*place)) for place in (one, other))]
+        found = held("on both sides of", "nightstand", "bed", *room, count=2)
+        pieces = furniture(np.array([box for *_, box in room]), np.zeros(3, int), [0, 1, 1])
+        (pair,) = findings(pieces.pieces(("bed", "nightstand")), None)["pairs_at_bed"]
+        assert found == (pair.holds and one[1] < -3)
+        seen.add((found, pair.holds))
+    assert seen == {(True, True), (False, True), (False, False)}
+
+
+WARDROBE = [-1.0, 1.0, -3.7, 1.2, 2.0, 0.6]
+
+
+@pytest.mark.parametrize(
+    ("back", "z", "blocked", "holds"),
+    [(0, -3.7, False, True), (2, -3.7, False, False), (0, -3.55, False, False),
+     (0, -3.7, True, False)],
+)  # fmt: skip
+@pytest.mark.parametrize("relation", ["at a wall", "with a free front"])
+def test_a_wardrobe_at_a_wall_has_its_back_to_it_and_its_front_free(
+    relation, back, z, blocked, holds
+):
+    box = [*WARDROBE[:2], z, *WARDROBE[3:]]
+    room = [("wardrobe", back, box)]
+    if blocked:
+        room.append(("sofa", 0, [-1.0, 0.4, -2.9, 1.6, 0.8, 0.8]))
+    assert held(relation, "wardrobe", None, *room) == holds
+    if not blocked:
+        assert held("back to a wall", "wardrobe", None, *room) == holds
+
+
+@pytest.mark.parametrize(
+    ("relation", "room", "holds"),
+    [
+        ("at", [("chair", 2, [0, 0.4, 1.5, 0.5, 0.9, 0.5])], True),
+        ("at", [("chair", 0, [0, 0.4, 1.5, 0.5, 0.9, 0.5])], False),
+        ("at", [("chair", 2, [0, 0.4, 1.7, 0.5, 0.9, 0.5])], False),
+        ("against", [("chair", 0, [0, 0.4, 1.5, 0.5, 0.9, 0.5])], True),
+        ("on both sides of", [("chair", 2, [0, 0.4, 1.5, 0.5, 0.9, 0.5]),
+                              ("chair", 0, [0, 0.4, 0.5, 0.5, 0.9, 0.5])], True),
+        ("on both sides of", [("chair", 2, [-0.3, 0.4, 1.5, 0.5, 0.9, 0.5]),
+                              ("chair", 2, [0.3, 0.4, 1.5, 0.5, 0.9, 0.5])], False),
+    ],
+)  # fmt: skip
+def test_chairs_at_a_table(relation, room, holds):
+    table = ("table", 1, [0.0, 0.4, 1.0, 1.6, 0.8, 0.5])
+    assert held(relation, "chair", "table", table, *room, count=len(room)) == holds
+
+
+def test_opposite_and_at_the_foot():
+    bed = ("bed", 0, BED)
+    sofa = [0.0, 0.4, -1.5, 1.6, 0.8, 0.8]
+    assert held("opposite", "sofa", "bed", bed, ("sofa", 2, sofa))
+    assert not held("opposite", "sofa", "bed", bed, ("sofa", 0, sofa))
+    assert held("at the foot of", "sofa", "bed", bed, ("sofa", 0, sofa))
+    assert not held("at the foot of", "sofa", "bed", bed, ("sofa", 0, [1.8, *sofa[1:]]))
+    assert not held("at the foot of", "sofa", "bed", bed, ("sofa", 0, [0.0, 0.4, -1.0, *sofa[3:]]))
