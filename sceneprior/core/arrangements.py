@@ -3,6 +3,8 @@ at tables, fronts that face free floor, backs at a wall, televisions before sofa
 and drawing share these definitions."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -51,7 +53,8 @@ LOW_M = 0.15
 """Height below which a piece, such as a rug, blocks no front."""
 
 
-class Piece(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Piece:
     """A piece of furniture on the floor plan."""
 
     label: str
@@ -63,19 +66,24 @@ class Piece(NamedTuple):
     """Unit vector (x, z) along its front; None if its yaw is unknown."""
     standing: bool
     """False for lamps and other pieces that hang."""
-    place: shapely.Polygon
-    """Its footprint."""
+
+    @cached_property
+    def place(self) -> shapely.Polygon:
+        """Its footprint."""
+        ahead = np.array([0.0, 1.0]) if self.front is None else self.front
+        width, _, depth = self.size_m
+        return _rectangle(self.center - ahead * depth / 2, ahead, width, depth)
 
     @classmethod
     def of(
-        cls, label: str, center_m: Sequence[float], box: Turned, knows_front: bool = True
+        cls, label: str, center_m: Sequence[float], size_m: Sequence[float], box: Turned | None
     ) -> "Piece":
-        """A piece with this centre (x, y, z) and oriented box."""
-        front = np.array([np.sin(box.yaw_rad), np.cos(box.yaw_rad)])
-        center, bottom_m = np.array(center_m)[::2], center_m[1] - box.size_m[1] / 2
+        """A piece with this centre (x, y, z), extents, and oriented box, if it is known."""
+        own_m = size_m if box is None else box.size_m
+        front = None if box is None else np.array([np.sin(box.yaw_rad), np.cos(box.yaw_rad)])
+        center, bottom_m = np.array(center_m)[::2], center_m[1] - size_m[1] / 2
         hangs = label in HUNG or (label in MOUNTED and bottom_m > MOUNTED_M)
-        place = _rectangle(center - front * box.size_m[2] / 2, front, box.size_m[0], box.size_m[2])
-        return cls(label, center, box.size_m, front if knows_front else None, not hangs, place)
+        return cls(label, center, (own_m[0], own_m[1], own_m[2]), front, not hangs)
 
     def before(self, depth_m: float) -> shapely.Polygon:
         """The rectangle before the front, as wide as the piece; behind it if the depth is
@@ -106,15 +114,7 @@ def _rectangle(
 
 def pieces_of(scene: Scene) -> list[Piece]:
     """The furniture of a scene on its floor plan."""
-    return [
-        Piece.of(
-            item.label,
-            item.center_m,
-            item.turned or Turned(0.0, item.size_m),
-            item.turned is not None,
-        )
-        for item in scene.objects
-    ]
+    return [Piece.of(item.label, item.center_m, item.size_m, item.turned) for item in scene.objects]
 
 
 class Finding(NamedTuple):
@@ -153,10 +153,11 @@ def end_of_bed(bed: Piece, other: Piece) -> tuple[float, float] | None:
     along, across, long_m, wide_m = _axes_of(bed)
     offset = other.center - bed.center
     end, side = float(np.sign(offset @ along)), float(np.sign(offset @ across))
+    if abs(abs(offset @ along) - long_m / 2) > AT_END_M:
+        return None
     middle = bed.center + side * across * wide_m / 2
     edge = shapely.LineString([middle - along * long_m / 2, middle + along * long_m / 2])
-    at_end = abs(abs(offset @ along) - long_m / 2) <= AT_END_M
-    return (end, side) if at_end and edge.distance(other.place) <= BESIDE_M else None
+    return (end, side) if edge.distance(other.place) <= BESIDE_M else None
 
 
 def _axes_of(bed: Piece) -> tuple[np.ndarray, np.ndarray, float, float]:

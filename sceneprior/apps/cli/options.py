@@ -134,6 +134,8 @@ def note_unmet(scenes: Sequence["Scene"]) -> None:
         unmet = [each["wish"] for each in room.extra.get("wishes", []) if not each["holds"]]
         if unmet:
             typer.echo(f"Note: {room.name} does not fulfil: {', '.join(unmet)}.", err=True)
+        if remarks := room.extra.get("remarks"):
+            typer.echo(f"Note: in {room.name}, {'; '.join(remarks)}.", err=True)
 
 
 def result_file(run: str, out: Path | None, name: str) -> Path:

@@ -159,7 +159,7 @@ def _asks_for_fronts(scene: Scene) -> bool:
     """True if a wish in `extra` that holds is about the front of an object."""
     wishes = scene.extra.get("wishes")
     return isinstance(wishes, list) and any(  # a file may hold anything
-        f" {relation} " in str(each.get("wish"))
+        f" {relation}" in str(each.get("wish"))
         for each in wishes
         if isinstance(each, dict) and each.get("holds") is True
         for relation in BY_FRONT

@@ -21,7 +21,7 @@ from sceneprior.lifted.drawing.steps import NUMBERS, Particles, Rejections, plac
 from sceneprior.lifted.lifting import HANGS_M
 from sceneprior.lifted.prototype_decoder import PrototypeDecoder
 from sceneprior.lifted.prototypes import POSES, PosedRooms
-from sceneprior.lifted.requests.checks import answers
+from sceneprior.lifted.requests.checks import answers, remarks
 from sceneprior.lifted.requests.floors import RoomShape
 from sceneprior.lifted.requests.relations import furniture_in
 from sceneprior.lifted.requests.request import RoomRequest
@@ -95,13 +95,10 @@ def draw_rooms(
         InputError: no room can meet the conditions, or none was found; the message says why.
     """
     check_floor(sampler, conditions, may_lack)
-    hard = conditions.has_rules or bool(conditions.wishes.bounds)
-    effort, rejections = REQUESTED if hard else PLAIN, Rejections()
+    effort, rejections = REQUESTED if conditions.has_rules else PLAIN, Rejections()
     slots, size = sampler.max_objects, max(1, BATCH // effort.particles)
     none = torch.zeros(count, slots, dtype=torch.int64)
-    rooms = PosedRooms(
-        none, none > 0, torch.zeros(count, slots, 6), looks=none.clone()
-    )  # fmt: skip
+    rooms = PosedRooms(none, none > 0, torch.zeros(count, slots, 6), looks=none.clone())
     rectangle_m, finished = torch.zeros(count, 4), set[int]()
     shapes: list[RoomShape | None] = [None] * count
     missing: list[tuple[int, ...]] = [()] * count
@@ -279,11 +276,11 @@ def sample_scenes(
 def _answered(
     scene: Scene, sampler: RoomSampler, conditions: Conditions, drawn: SampledRooms, row: int
 ) -> Scene:
-    """A requested room with the answers to its wishes, if it has any."""
+    """A requested room with the answers to its wishes, if it has any, and with remarks."""
     if "wishes" not in scene.extra:
         return scene
     found = answers(scene, conditions, furniture_in(sampler, drawn.rooms, row).front)
-    return replace(scene, extra={**scene.extra, "wishes": found})
+    return replace(scene, extra={**scene.extra, "wishes": found, "remarks": remarks(scene)})
 
 
 def _scene_of(

@@ -11,11 +11,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sceneprior.core.mixtures import draw_index
-from sceneprior.lifted.drawing.plans import BEYOND_M, RoomPlans, read_rooms
+from sceneprior.lifted.drawing.overlaps import resolve_overlap, violation
+from sceneprior.lifted.drawing.plans import RoomPlans, read_rooms
 from sceneprior.lifted.requests.relations import Furniture, furniture_of
 from sceneprior.lifted.requests.rules import PlacementRules
 from sceneprior.lifted.sampler.contents import END
-from sceneprior.lifted.sampler.frames import GRAZE_M, shared_extents
 from sceneprior.lifted.sampler.network import EncoderState, RoomSampler
 from sceneprior.lifted.sampler.placement import Places
 
@@ -31,9 +31,6 @@ COMPARED = 16
 FLUSH, ADJACENT = 0.5, 0.25
 """Probabilities, along each axis, that a candidate is flush with a side of a rectangle in the
 floor, and that it is adjacent to an object or flush with it."""
-INTERSECTING = 0.01
-"""Shared volume, relative to the smaller box, above which two boxes count as intersecting; the same
-as in the evaluation."""
 
 Rejections = Counter[tuple[int, str]]
 """Number of places rejected for an object, by its class and the reason."""
@@ -192,12 +189,14 @@ def place_next(
     lost = ~particles.alive.unflatten(0, (-1, particles.each)).any(dim=1)
     required = particles.plans.required[now.room[waiting], step]
     for at in waiting[lost[now.room[waiting]] & required].tolist():
-        if reason := now.search(at, draws[int(now.room[at])]):
-            rejections[int(now.label[at]), reason] += 1
-        else:
-            particles.alive[rows[at]] = True
+        room = int(now.room[at])
+        if lost[room]:
+            if reason := now.search(at, draws[room]):
+                rejections[int(now.label[at]), reason] += 1
+            else:
+                particles.alive[rows[at]], lost[room] = True, False
     for at, (look, box_m) in spare.items():
-        if lost[now.room[at]] and not particles.alive[rows[at]]:
+        if lost[now.room[at]]:
             particles.place(rows[[at]], now.label[[at]], look[None], box_m[None])
             particles.alive[rows[at]] = True
 
@@ -258,7 +257,8 @@ class _Step:
 
     def is_sound(self, at: int, candidate: Furniture) -> bool:
         """True if a place adds no fault to the room of row `at` (`PlacementRules.faults`)."""
-        assert self.particles.rules is not None
+        if self.particles.rules is None:
+            return True
         rules, placed = (
             self.particles.rules[int(self.room[at])],
             self._furniture[int(self.rows[at])],
@@ -285,9 +285,11 @@ class _Step:
             return "free floor"
         own = self.candidates(found.rows(free), boxes_m[free])
         allowed, reason = self.allowed(at, *own, COMPARED)
-        fits = free[torch.from_numpy(allowed)][:COMPARED]
+        fits = torch.from_numpy(allowed).nonzero()[:COMPARED, 0]
         if not len(fits):
             return reason
+        sound = [row for row in fits.tolist() if self.is_sound(at, own[0].rows([row]))]
+        fits = free[torch.tensor(sound) if sound else fits]
         density = found.rows(fits).places().log_prob(boxes_m[fits][:, [0, 2]])
         chosen = fits[draw_index(density[None], torch.tensor([draws.random()]).float())]
         particles.place(row[None], self.label[[at]], found.look[chosen], boxes_m[chosen])
@@ -315,43 +317,3 @@ def _anywhere(
         beside = near[:, [0, 2]] + side * np.where(outside, theirs + own, theirs - own)
         found = np.where((way >= FLUSH) & (way < FLUSH + ADJACENT), beside, found)
     return torch.from_numpy(found).float()
-
-
-def resolve_overlap(
-    boxes_m: Float[Tensor, "rooms 6"], state: EncoderState, apart: Bool[Tensor, "rooms objects"]
-) -> Float[Tensor, "rooms 6"]:
-    """Move boxes out of objects marked in `apart`, and into the rectangle, along each axis by at
-    most `GRAZE_M`, because sampled places are not accurate to the centimetre."""
-    others_m = state.before.boxes_m
-    shared = shared_extents(boxes_m.unsqueeze(1), others_m)
-    grazes = apart & state.before.is_object & (shared > 0).all(dim=-1)
-    x_and_z, away = shared[..., ::2], (boxes_m.unsqueeze(1) - others_m)[..., [0, 2]]
-    least = x_and_z == x_and_z.amin(dim=-1, keepdim=True)
-    moves = x_and_z * away.sign() * (least & (x_and_z <= GRAZE_M) & grazes.unsqueeze(-1))
-    centre = boxes_m[:, [0, 2]] + moves.sum(dim=1)
-    middle, extents = state.rectangle_m.split(2, dim=-1)
-    free = ((extents - boxes_m[:, [3, 5]]) / 2).clamp(min=0)
-    inside = centre.clamp(middle - free, middle + free)
-    centre = inside.where((inside - centre).abs() <= GRAZE_M, centre)
-    moved = boxes_m.clone()
-    moved[:, [0, 2]] = centre
-    return moved
-
-
-def violation(
-    boxes_m: Float[Tensor, "rooms 6"], state: EncoderState, apart: Bool[Tensor, "rooms objects"]
-) -> Float[Tensor, " rooms"]:
-    """Violation of a box; 0 if there is none.
-
-    The violation is the sum of two terms: the shared volumes with objects marked in `apart`, each
-    relative to the smaller box, and the metres by which the box extends beyond the rectangle.
-    """
-    others = state.before
-    here, theirs = boxes_m.unsqueeze(1), others.boxes_m
-    shared = shared_extents(here, theirs).prod(dim=-1)
-    least = torch.minimum(here[..., 3:].prod(dim=-1), theirs[..., 3:].prod(dim=-1))
-    share = shared / least.clamp(min=1e-9)
-    share = share.where((share > INTERSECTING) & others.is_object & apart, 0.0)
-    middle, extents = state.rectangle_m.split(2, dim=-1)
-    beyond = (boxes_m[:, [0, 2]] - middle).abs() + (boxes_m[:, [3, 5]] - extents) / 2
-    return share.sum(dim=-1) + (beyond.amax(dim=-1) - BEYOND_M).clamp(min=0)

@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from sceneprior.core.arrangements import findings, pieces_of
 from sceneprior.core.classes import UnknownClassError
 from sceneprior.core.errors import InputError, InputWarning
 from sceneprior.core.scene import Opening, Scene, SceneObject
 from sceneprior.core.scene_json import WALL_M
+from sceneprior.core.shell import floor_polygon
 from sceneprior.lifted.requests.floors import Floor, RoomShape
 from sceneprior.lifted.requests.openings import WantedOpening, walls_for
 from sceneprior.lifted.requests.relations import Furniture, RelationChecks, footprints
@@ -26,6 +28,16 @@ small ones."""
 BEYOND_M, ABOVE_M = 0.015, 1e-4
 """Distances by which drawn objects may extend beyond the floor and, since files round lengths,
 beyond the ceiling."""
+FAULTS = {
+    "pairs_at_bed": "{1} and {2} do not stand at one end of the {0}, on its two sides",
+    "chairs_at_tables": "{0} stands at no table",
+    "chairs_turned": "{0} is not turned to its {1}",
+    "tables_with_chairs": "{0} has no chair",
+    "screens_seen": "{0} and the seats do not face each other",
+    "fronts_free": "{0} has no free floor before its front",
+    "backs_covered": "{0} has its back at no wall",
+}
+"""Words for failed checks of function."""
 
 
 def check_request(
@@ -115,8 +127,8 @@ def _contradiction(one: str, other: str) -> InputError:
 def answers(
     scene: Scene, asked: Conditions, front: Float[np.ndarray, "objects 2"]
 ) -> list[dict[str, Any]]:
-    """Each wish, and whether it holds in a scene; then other requested openings, the floor and the
-    ceiling.
+    """Each wish, and whether it holds in a scene, `implied` ones included (`Wishes.implied`); then
+    other requested openings, the floor and the ceiling.
 
     Args:
         front: Unit vectors (x, z) of the fronts of objects without a yaw.
@@ -130,8 +142,9 @@ def answers(
     found = [(str(wish), wish.holds(counts[wish.label])) for wish in wishes.counts]
     if scene.floor_m is not None:
         floor = Floor(scene.floor_m)
-        checks = RelationChecks(wishes.relations, RoomShape(floor, scene.openings), asked.classes)
-        found += zip(map(str, wishes.relations), checks.held(furniture), strict=True)
+        relations = (*wishes.relations, *wishes.implied)
+        checks = RelationChecks(relations, RoomShape(floor, scene.openings), asked.classes)
+        found += zip(map(str, relations), checks.held(furniture), strict=True)
         for each in asked.openings:
             plain = WantedOpening(each.kind)
             if each != plain or each.kind not in wishes.needs:
@@ -146,7 +159,26 @@ def answers(
     if asked.ceiling_m is not None:
         below = (new[:, 1] + new[:, 4] / 2 <= asked.ceiling_m + ABOVE_M).all()
         found.append((f"all{added} below the ceiling of {asked.ceiling_m:g} m", bool(below)))
-    return [{"wish": text, "holds": holds} for text, holds in found]
+    implied = {str(wish) for wish in wishes.implied}
+    return [
+        {"wish": text, "holds": holds} | ({"implied": True} if text in implied else {})
+        for text, holds in found
+    ]
+
+
+def remarks(scene: Scene) -> list[str]:
+    """Faults of function in a room (`core/arrangements.py`), in words."""
+    labels = [item.label for item in scene.objects]
+    names = [
+        f"{label} {labels[:row].count(label) + 1}" if labels.count(label) > 1 else label
+        for row, label in enumerate(labels)
+    ]
+    return [
+        FAULTS[check].format(*(names[row].replace("_", " ") for row in each.rows))
+        for check, found in findings(pieces_of(scene), floor_polygon(scene)).items()
+        for each in found
+        if not each.holds
+    ]
 
 
 def _is(wanted: Opening | WantedOpening, placed: Opening, floor: Floor) -> bool:

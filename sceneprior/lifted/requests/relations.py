@@ -70,7 +70,7 @@ class Furniture(NamedTuple):
     front: Float[np.ndarray, "objects 2"]
     """Unit vector (x, z) along which the front points; it need not be opposite to `back`."""
 
-    def rows(self, rows: np.ndarray | slice) -> "Furniture":
+    def rows(self, rows: np.ndarray | slice | list[int]) -> "Furniture":
         """The objects of these rows."""
         return Furniture(*(part[rows] for part in self))
 
@@ -86,7 +86,7 @@ class Furniture(NamedTuple):
         ):
             quarters = round(float(np.arctan2(*front)) / (np.pi / 2)) % 4
             name = classes[label] if 0 <= label < len(classes) else ""
-            found.append(Piece.of(name, box[:3], quarter_turned(box[3:], quarters)))
+            found.append(Piece.of(name, box[:3], box[3:], quarter_turned(box[3:], quarters)))
         return found
 
     def joined(self, others: "Furniture") -> "Furniture":
@@ -270,25 +270,22 @@ class RelationChecks:
         """True for each relation that holds in a furnished room."""
         return [self._number(wish, furniture) >= wish.count for wish in self.wishes]
 
-    def can_hold(
-        self, label: int, candidates: Furniture, placed: Furniture, upcoming: Sequence[int]
-    ) -> Bool[np.ndarray, " candidates"]:
-        """True for places of the next object, of class `label`, after which every relation is still
-        possible. Upcoming objects are assumed to find places in which their relations hold."""
-        possible = np.ones(len(candidates.back), dtype=bool)
-        name = self.classes[label]
-        later = [self.classes[index] for index in upcoming]
+    def can_hold(self, label: int, furniture: Furniture, upcoming: Sequence[int]) -> bool:
+        """True if every relation is still possible in a partly furnished room, whose last object is
+        of class `label`. Upcoming objects are assumed to find places in which their relations
+        hold."""
+        name, later = self.classes[label], [self.classes[index] for index in upcoming]
         for wish in self.wishes:
             at_bed = wish.relation in ("beside", "on both sides of") and wish.target in BEDS
-            named = name in (wish.subject, wish.target) or at_bed or _needs_free_front(wish)
+            named = name in (wish.subject, wish.target) or at_bed or wish.needs_free_front
             if not named or wish.target in later:
                 continue
-            coming = later.count(wish.subject)
-            for row in np.flatnonzero(possible):
-                joined = placed.joined(candidates.rows(slice(row, row + 1)))
-                most = min(coming, self._free_sides(wish, joined)) if at_bed and coming else coming
-                possible[row] = self._number(wish, joined) + most >= wish.count
-        return possible
+            most = later.count(wish.subject)
+            if at_bed and most:
+                most = min(most, self._free_sides(wish, furniture))
+            if self._number(wish, furniture) + most < wish.count:
+                return False
+        return True
 
     def _free_sides(self, wish: RelationWish, furniture: Furniture) -> int:
         """The largest number of subjects that still find a place beside a bed."""
@@ -342,7 +339,7 @@ class RelationChecks:
             found = related_to_room(wish.relation, subjects, floor)
             if wish.subject in OPENED and wish.relation == "at a wall":
                 found = related_to_room("back to a wall", subjects, floor)
-        if not _needs_free_front(wish):
+        if not wish.needs_free_front:
             return found
         pieces = furniture.pieces(self.classes)
         rows = np.flatnonzero(furniture.object_class == self.index[wish.subject])
@@ -351,9 +348,3 @@ class RelationChecks:
             for each in outcomes:
                 usable[each.rows[0]] &= each.holds
         return found & np.array(usable, dtype=bool)[rows]
-
-
-def _needs_free_front(wish: RelationWish) -> bool:
-    return wish.relation == "with a free front" or (
-        wish.relation == "at a wall" and wish.subject in OPENED
-    )

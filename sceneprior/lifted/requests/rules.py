@@ -128,18 +128,17 @@ class PlacementRules:
         }.items():
             reason = reason or name * bool((allowed & ~passed).any())
             allowed &= passed
-        rows = np.flatnonzero(allowed)
-        allowed[rows] = self.relations.can_hold(label, candidates.rows(rows), placed, upcoming)
-        if not allowed[rows].all():
-            reason = reason or "a place that its relations allow"
-        if self._paths is None:
-            return allowed, reason
         for row in np.flatnonzero(allowed):
+            allowed[row] = False
+            if enough <= 0:
+                continue
             joined = placed.joined(candidates.rows(slice(row, row + 1)))
-            allowed[row] = enough > 0 and self._all_reached(joined)
-            if enough > 0 and not allowed[row]:
+            if not self.relations.can_hold(label, joined, upcoming):
+                reason = reason or "a place that its relations allow"
+            elif not self._all_reached(joined):
                 reason = reason or "a path from a door"
-            enough -= int(allowed[row])
+            else:
+                allowed[row], enough = True, enough - 1
         return allowed, reason
 
     def faults(self, furniture: Furniture) -> set[tuple[str, tuple[int, ...]]]:
@@ -265,5 +264,7 @@ class Paths:
 
 
 def needs_access(labels: Sequence[str]) -> Bool[np.ndarray, " labels"]:
-    """True for classes that must be reachable: all but lamps and plants."""
-    return np.array([not any(word in label for word in ("lamp", "plant")) for label in labels])
+    """True for classes that must be reachable: all but lamps, plants, and nightstands, which are
+    reached from the bed."""
+    words = ("lamp", "plant", *NIGHTSTANDS)
+    return np.array([not any(word in label for word in words) for label in labels])

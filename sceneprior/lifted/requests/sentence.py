@@ -7,30 +7,24 @@ the size of the floor or a room type. Unknown words are an error, so that no wis
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from sceneprior.core.arrangements import BEDS, CHAIRS, TABLES
-from sceneprior.core.classes import LABEL_SETS
 from sceneprior.core.errors import InputError
 from sceneprior.lifted.requests.vocabulary import (
     BOUNDS,
-    ENDS,
-    FILLERS,
-    INVERTED_WORDS,
-    NOUNS,
     NUMBERS,
     RELATION_WORDS,
-    RELATIONS_TO_IT,
-    ROOM_WORDS,
-    ROOMS,
-    WALL_WORDS,
-)  # fmt: skip
+    SIZE_TOKEN,
+    Token,
+    lex,
+    meanings_of,
+)
 from sceneprior.lifted.requests.wishes import (
     OPENINGS,
     CountWish,
     RelationWish,
     Wishes,
-    count_of,
     meant_relation,
 )  # fmt: skip
 
@@ -40,8 +34,6 @@ _UNIT = r"\s*(?:m|metres?|meters?)?"
 _SIZE = re.compile(rf"(\d+\.?\d*){_UNIT}\s*(?:x|×|by)\s*(\d+\.?\d*){_UNIT}\b(?!\s*[cm]m\b)")
 _LENGTH = re.compile(r"\d+\.?\d*\s*(?:mm|cm|m|metres?|meters?|centimetres?|centimeters?)\b")
 _NEGATIVE = re.compile(r"(?:(?<!\w)|(?<=[^-−][x×]))[-−]\d[\w.]{0,9}")
-_SIZE_TOKEN = "#"
-"""Token for the size of the floor, so that it is not mistaken for the size of furniture."""
 _TOKEN = re.compile(r"[a-z_']+|\d+(?:\.\d+)?|\S")
 
 
@@ -77,11 +69,11 @@ def read_sentence(text: str, known: Sequence[str], label_set: str) -> Sentence:
     sizes = _SIZE.findall(lowered)
     if len(sizes) > 1:
         raise InputError(f"The request names {len(sizes)} sizes of floors; expected one.")
-    rest = _SIZE.sub(f" {_SIZE_TOKEN} ", lowered.replace(_SIZE_TOKEN, "?"))
+    rest = _SIZE.sub(f" {SIZE_TOKEN} ", lowered.replace(SIZE_TOKEN, "?"))
     if (length := _LENGTH.search(rest)) is not None:
         raise _other_length(length[0])
-    meanings = _meanings(known)
-    reader = _Reader(_lex(_TOKEN.findall(rest), meanings), label_set, meanings["bed"][1][1])
+    meanings = meanings_of(known)
+    reader = _Reader(lex(_TOKEN.findall(rest), meanings), label_set, meanings["bed"][1][1])
     if reader.strange:
         # If another word is unknown, words before a noun are left out: usually it is their noun.
         fine = {"a", "an", "the", *RELATION_WORDS, *NUMBERS, *" ".join(BOUNDS).split()}
@@ -106,65 +98,6 @@ def _other_length(length: str) -> InputError:
     )
 
 
-class _Token(NamedTuple):
-    """A phrase of the vocabulary, or an unknown word."""
-
-    text: str
-    kind: str = "unknown"
-    value: Any = None
-
-
-def _meanings(known: Sequence[str]) -> dict[str, tuple[str, Any]]:
-    """The kind and the value of each phrase; later entries override earlier ones."""
-    nouns = {name.replace("_", " "): (name,) for names in LABEL_SETS.values() for name in names[1:]}
-    nouns |= {noun: classes for noun, classes in NOUNS.items() if noun not in known}
-    nouns |= {name.replace("_", " "): (name,) for name in known}
-    nouns |= {opening: (opening,) for opening in OPENINGS}
-    labels = {
-        noun: next((name for name in classes if name in known), classes[0])
-        for noun, classes in nouns.items()
-    }
-    plurals = {
-        plural: label
-        for noun, label in labels.items()
-        for plural in (f"{noun}s", f"{noun[:-1]}ves" if noun.endswith("f") else f"{noun}es")
-    }
-    return (
-        {word: ("filler", None) for word in (*FILLERS, _SIZE_TOKEN)}
-        | {word: ("before a room", None) for word in ("in", "for", "of")}
-        | {word: ("pronoun", None) for word in ("it", "them")}
-        | {"the": ("the", None), "some": ("some", None), "any": ("some", None)}
-        | {"its": ("possessive", None), "their": ("possessive", None), "'s": ("'s", None)}
-        | {noun: ("noun", (True, label)) for noun, label in plurals.items()}
-        | {noun: ("noun", (False, label)) for noun, label in labels.items()}
-        | {room: ("room", ends) for room, ends in ROOMS.items()}
-        | {word: ("number", number) for word, number in NUMBERS.items()}
-        | {word: ("bound", sign) for word, sign in BOUNDS.items()}
-        | {word: ("relation", relation) for word, relation in RELATION_WORDS.items()}
-        | {word: ("relation to it", relation) for word, relation in RELATIONS_TO_IT.items()}
-        | {word: ("inverted relation", relation) for word, relation in INVERTED_WORDS.items()}
-        | {word: ("relation to the room", relation) for word, relation in ROOM_WORDS.items()}
-        | {word: ("end of a bed", end) for word, end in ENDS.items()}
-        | {word: ("wall", wall) for word, wall in WALL_WORDS.items()}
-    )
-
-
-def _lex(words: list[str], meanings: dict[str, tuple[str, Any]]) -> list[_Token]:
-    """Split words into the longest phrases of the vocabulary, from left to right."""
-    longest = max(len(phrase.split()) for phrase in meanings)
-    tokens: list[_Token] = []
-    while words:
-        for length in range(min(longest, len(words)), 0, -1):
-            if (phrase := " ".join(words[:length])) in meanings:
-                break
-        if phrase.isdecimal():
-            tokens.append(_Token(phrase, "number", count_of(phrase)))
-        else:
-            tokens.append(_Token(phrase, *meanings.get(phrase, ())))
-        words = words[length:]
-    return tokens
-
-
 @dataclass
 class _Group:
     """The objects of one phrase."""
@@ -184,8 +117,8 @@ class _Reader:
     """Reads tokens from left to right; `strange` collects words without a meaning where they
     stand. `bed` is the class that "bed" means."""
 
-    def __init__(self, tokens: list[_Token], label_set: str, bed: str):
-        self.tokens, self.label_set, self.bed = [*tokens, _Token("", "end")], label_set, bed
+    def __init__(self, tokens: list[Token], label_set: str, bed: str):
+        self.tokens, self.label_set, self.bed = [*tokens, Token("", "end")], label_set, bed
         self.strange: list[str] = []
         self.openings: list[str] = []
         self.groups: list[_Group] = []
@@ -231,7 +164,7 @@ class _Reader:
                 counts.append(CountWish(group.noun, group.number, most, group.said))
         return Wishes(tuple(counts), tuple(self.relations))
 
-    def _next(self, *kinds: str) -> _Token | None:
+    def _next(self, *kinds: str) -> Token | None:
         """Read the next token if it is of one of these kinds."""
         token = self.tokens[self.at]
         if token.kind not in kinds:
@@ -336,7 +269,7 @@ class _Reader:
         if counted is not None and counted.text == "without":
             self.at += self.tokens[self.at].text in ("a", "an", "any")
         some = number is None and self._next("some") is not None
-        sized = self.tokens[self.at].text == _SIZE_TOKEN
+        sized = self.tokens[self.at].text == SIZE_TOKEN
         self.at += sized
         if self._room(number, bound):
             return None
@@ -360,7 +293,7 @@ class _Reader:
         self.subject = group
         return group
 
-    def _opening(self, group: _Group, wall: _Token | None) -> None:
+    def _opening(self, group: _Group, wall: Token | None) -> None:
         """List the doors or windows of a group, unless it sets only an upper bound."""
         named = f"{group.noun}@{wall.value}" if wall else group.noun
         if wall and (not group.number or group.sign == "<="):
@@ -373,7 +306,7 @@ class _Reader:
                     self.openings.remove(group.noun)
                 self.openings.append(named)
 
-    def _room(self, number: int | None, bound: _Token | None) -> bool:
+    def _room(self, number: int | None, bound: Token | None) -> bool:
         """Read a room type, and refuse a type that the prior does not draw."""
         if (room := self._next("room")) is None:
             return False

@@ -1,4 +1,10 @@
-"""Words of requests in English."""
+"""Words of requests in English, and the phrases of a sentence."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from sceneprior.core.classes import LABEL_SETS
+from sceneprior.lifted.requests.wishes import OPENINGS, count_of
 
 NOUNS: dict[str, tuple[str, ...]] = {
     "bed": ("double_bed", "single_bed", "kids_bed", "bed"),
@@ -104,3 +110,64 @@ FILLERS = (
     "should",
 )  # fmt: skip
 """Words that are skipped."""
+SIZE_TOKEN = "#"
+"""Token for the size of the floor, so that it is not mistaken for the size of furniture."""
+
+
+class Token(NamedTuple):
+    """A phrase of the vocabulary, or an unknown word."""
+
+    text: str
+    kind: str = "unknown"
+    value: Any = None
+
+
+def meanings_of(known: Sequence[str]) -> dict[str, tuple[str, Any]]:
+    """The kind and the value of each phrase; later entries override earlier ones."""
+    nouns = {name.replace("_", " "): (name,) for names in LABEL_SETS.values() for name in names[1:]}
+    nouns |= {noun: classes for noun, classes in NOUNS.items() if noun not in known}
+    nouns |= {name.replace("_", " "): (name,) for name in known}
+    nouns |= {opening: (opening,) for opening in OPENINGS}
+    labels = {
+        noun: next((name for name in classes if name in known), classes[0])
+        for noun, classes in nouns.items()
+    }
+    plurals = {
+        plural: label
+        for noun, label in labels.items()
+        for plural in (f"{noun}s", f"{noun[:-1]}ves" if noun.endswith("f") else f"{noun}es")
+    }
+    return (
+        {word: ("filler", None) for word in (*FILLERS, SIZE_TOKEN)}
+        | {word: ("before a room", None) for word in ("in", "for", "of")}
+        | {word: ("pronoun", None) for word in ("it", "them")}
+        | {"the": ("the", None), "some": ("some", None), "any": ("some", None)}
+        | {"its": ("possessive", None), "their": ("possessive", None), "'s": ("'s", None)}
+        | {noun: ("noun", (True, label)) for noun, label in plurals.items()}
+        | {noun: ("noun", (False, label)) for noun, label in labels.items()}
+        | {room: ("room", ends) for room, ends in ROOMS.items()}
+        | {word: ("number", number) for word, number in NUMBERS.items()}
+        | {word: ("bound", sign) for word, sign in BOUNDS.items()}
+        | {word: ("relation", relation) for word, relation in RELATION_WORDS.items()}
+        | {word: ("relation to it", relation) for word, relation in RELATIONS_TO_IT.items()}
+        | {word: ("inverted relation", relation) for word, relation in INVERTED_WORDS.items()}
+        | {word: ("relation to the room", relation) for word, relation in ROOM_WORDS.items()}
+        | {word: ("end of a bed", end) for word, end in ENDS.items()}
+        | {word: ("wall", wall) for word, wall in WALL_WORDS.items()}
+    )
+
+
+def lex(words: list[str], meanings: dict[str, tuple[str, Any]]) -> list[Token]:
+    """Split words into the longest phrases of the vocabulary, from left to right."""
+    longest = max(len(phrase.split()) for phrase in meanings)
+    tokens: list[Token] = []
+    while words:
+        for length in range(min(longest, len(words)), 0, -1):
+            if (phrase := " ".join(words[:length])) in meanings:
+                break
+        if phrase.isdecimal():
+            tokens.append(Token(phrase, "number", count_of(phrase)))
+        else:
+            tokens.append(Token(phrase, *meanings.get(phrase, ())))
+        words = words[length:]
+    return tokens

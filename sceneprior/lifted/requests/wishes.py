@@ -7,9 +7,10 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import product
 from typing import Any
 
-from sceneprior.core.arrangements import BEDS, NIGHTSTANDS
+from sceneprior.core.arrangements import BEDS, CHAIRS, NIGHTSTANDS, OPENED, TABLES
 from sceneprior.core.checked import plain, shown
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Opening, SceneObject
@@ -71,6 +72,12 @@ class RelationWish:
     """A class, `door` or `window`; None for relations to the room."""
     count: int = 1
 
+    @property
+    def needs_free_front(self) -> bool:
+        """True if the floor before the subject must be free."""
+        at_wall = self.relation == "at a wall" and self.subject in OPENED
+        return at_wall or self.relation == "with a free front"
+
     def __str__(self) -> str:
         number = "" if self.count == 1 else f"{self.count} "
         return f"{number}{self.subject} {self.relation} {self.target or ''}".strip()
@@ -104,6 +111,29 @@ class Wishes:
             )
             for label, own in self.needs.items()
         }
+
+    @cached_property
+    def implied(self) -> tuple[RelationWish, ...]:
+        """Relations of the required objects that go without saying: fronts are free, chairs stand
+        at a table, two nightstands at their bed. Those of objects with a relation of the request
+        are left to it."""
+        least = {label: low for label, (low, _) in self.bounds.items() if low}
+        said = {(wish.subject, wish.relation) for wish in self.relations}
+        placed = {wish.subject for wish in self.relations}
+        found = [
+            RelationWish(label, "with a free front", None, least[label])
+            for label in OPENED
+            if label in least and (label, "at a wall") not in said
+        ]
+        for chair, table in product(CHAIRS, TABLES):
+            if chair in least and table in least and chair not in placed:
+                count = least[chair] if table == "table" else 1
+                found.append(RelationWish(chair, "at", table, count))
+        beds = [label for label in BEDS if label in least]
+        for stand in NIGHTSTANDS:
+            if len(beds) == least.get(beds[0] if beds else "") == 1 and least.get(stand) == 2:
+                found.append(RelationWish(stand, "on both sides of", beds[0], 2))
+        return tuple(wish for wish in found if wish not in self.relations)
 
 
 @dataclass(frozen=True)
@@ -140,9 +170,9 @@ class Conditions:
     @property
     def has_rules(self) -> bool:
         """True if there are conditions that the network does not know, so that places of objects
-        must be checked: openings, a ceiling, relations, or a floor that is not a rectangle."""
+        must be checked: wishes, openings, a ceiling, or a floor that is not a rectangle."""
         odd_floor = self.floor is not None and not self.floor.is_rectangle
-        return bool(self.openings or self.wishes.relations or self.ceiling_m or odd_floor)
+        return bool(self.openings or self.wishes.needs or self.ceiling_m or odd_floor)
 
 
 def read_wishes(want: Any) -> Wishes | None:

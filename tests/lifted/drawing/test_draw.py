@@ -7,8 +7,8 @@ from torch.testing import assert_close
 
 from sceneprior.lifted.drawing import draw as module
 from sceneprior.lifted.drawing.draw import PLAIN, SampledRooms, draw_rooms
+from sceneprior.lifted.drawing.overlaps import INTERSECTING
 from sceneprior.lifted.drawing.plans import BEYOND_M
-from sceneprior.lifted.drawing.steps import INTERSECTING
 from sceneprior.lifted.prototypes import PosedRooms
 from sceneprior.lifted.requests.floors import Floor, read_floor
 from sceneprior.lifted.requests.wishes import Conditions, CountWish, Wishes
