@@ -88,7 +88,7 @@ ASKED: dict[str, dict[str, Any]] = {
     "latents": {"floor": "4x3", "distribution": "paper"},
     "floor_twice": {"floor": "5x3", "want": "a 4 x 3 m bedroom"},
     "words_unknown": {"want": "a purple bed"},
-    "words_of_a_phrase": {"want": "a nightstand on each side of the bed"},
+    "words_of_a_phrase": {"want": "a nightstand on the other side of the bed"},
     "words_nouns_only": {"want": "a bed and at least three pianos and 4 organs"},
     "words_relation_alone": {"want": "beside the bed"},
     "words_two_bedrooms": {"want": "two bedrooms"},
