@@ -41,16 +41,16 @@ MAY_TOO = {
 
 BUDGET = {
     "data_prep": (12805, 60),
-    "sceneprior/core": (5898, 28),
+    "sceneprior/core": (6179, 29),
     "sceneprior/furniture": (591, 4),
     "sceneprior/render": (4613, 23),
     "sceneprior/training": (1258, 7),
     "sceneprior/paper": (2697, 13),
-    "sceneprior/lifted": (8262, 42),
+    "sceneprior/lifted": (8645, 43),
     "sceneprior/baselines": (2909, 14),
-    "sceneprior/evaluation": (4557, 21),
+    "sceneprior/evaluation": (4389, 21),
     "sceneprior/interchange": (892, 5),
-    "sceneprior/apps": (6714, 39),
+    "sceneprior/apps": (6737, 39),
 }
 """Most lines and modules of a folder. They go down freely, and up only in a commit that says what
 it bought and what went for it."""
