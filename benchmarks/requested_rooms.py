@@ -39,12 +39,14 @@ from sceneprior.evaluation.metric import Comparison, RoomSet
 from sceneprior.evaluation.metrics.layouts import layout_classifier_accuracy
 from sceneprior.lifted.requests.floors import Floor, RoomShape
 from sceneprior.lifted.requests.relations import OUTWARD, Furniture, RelationChecks
-from sceneprior.lifted.requests.wishes import TO_ROOM, TO_TARGET, RelationWish
+from sceneprior.lifted.requests.wishes import TO_ROOM, TO_TARGET, RelationWish, meant_relation
 
 RELATIONS = 2
 """Number of relations per request."""
-BY_FRONT_OF_TARGET = ("beside", "in front of")
-BY_FRONT_OF_SUBJECT = ("facing",)
+BY_FRONT_OF_TARGET = (
+    "beside", "on both sides of", "at the foot of", "opposite", "in front of",
+)  # fmt: skip
+BY_FRONT_OF_SUBJECT = ("facing", "at", "opposite", "back to a wall", "with a free front")
 
 
 def main() -> None:
@@ -137,7 +139,12 @@ def requests_of(
         counts = Counter(item.label for item in half)
         want: dict[str, Any] = {label: f">={times}" for label, times in counts.items()}
         want["relations"] = [
-            {"subject": wish.subject, "relation": wish.relation, "target": wish.target}
+            {
+                "subject": wish.subject,
+                "relation": wish.relation,
+                "target": wish.target,
+                "count": wish.count,
+            }
             for wish in relations
         ]
         request = {"floor": room.floor_m, "want": want}
@@ -152,9 +159,14 @@ def relations_of(
 ) -> list[RelationWish]:
     """Relations that hold between the given objects in their room."""
     labels = sorted({item.label for item in half})
-    wishes = [RelationWish(label, relation) for label in labels for relation in TO_ROOM]
+    wishes = [
+        RelationWish(label, relation)
+        for label in labels
+        for relation in TO_ROOM
+        if has_front(label) or relation not in BY_FRONT_OF_SUBJECT
+    ]
     wishes += [
-        RelationWish(label, relation, other)
+        meant_relation(label, relation, other, 1)
         for label in labels
         for other in labels
         if label != other
@@ -181,7 +193,12 @@ def accuracy(
         cast(RoomSet, SimpleNamespace(scenes=scenes, counts=np.ones((1, len(scenes)), dtype=int)))
         for scenes in (rooms, test)
     )
-    compared = cast(Comparison, SimpleNamespace(test=others, real=real, seed=seed))
+    compared = cast(
+        Comparison,
+        SimpleNamespace(
+            test=others, train=real, val=[], seed=seed, is_training_set=lambda rooms: False
+        ),
+    )
     found = layout_classifier_accuracy(own, compared)
     assert found.value is not None
     return round(found.value, 3)
