@@ -48,9 +48,9 @@ BUDGET = {
     "sceneprior/paper": (2697, 13),
     "sceneprior/lifted": (8645, 43),
     "sceneprior/baselines": (2909, 14),
-    "sceneprior/evaluation": (4389, 21),
+    "sceneprior/evaluation": (4401, 21),
     "sceneprior/interchange": (892, 5),
-    "sceneprior/apps": (6737, 39),
+    "sceneprior/apps": (6733, 39),
 }
 """Most lines and modules of a folder. They go down freely, and up only in a commit that says what
 it bought and what went for it."""

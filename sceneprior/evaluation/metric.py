@@ -137,6 +137,10 @@ class RoomSet:
     """Multiplicity of each room: 1 in row 0, then in each bootstrap resample."""
 
 
+EMPTY = "generated rooms are empty"
+"""Words of a note by which pages recognise it."""
+
+
 def emptiness(scenes: Sequence[Scene]) -> str | None:
     """A warning if more than half of the generated rooms are empty; else None.
 
@@ -147,7 +151,7 @@ def emptiness(scenes: Sequence[Scene]) -> str | None:
     if 2 * empty <= len(scenes):
         return None
     return (
-        f"{empty} of {len(scenes)} generated rooms are empty, so none of the other scores can be "
+        f"{empty} of {len(scenes)} {EMPTY}, so none of the other scores can be "
         "trusted: train longer."
     )
 

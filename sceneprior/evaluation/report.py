@@ -18,6 +18,7 @@ from sceneprior.core.classes import label_set
 from sceneprior.core.ground_truth import known_in_3d, reference_scenes
 from sceneprior.core.scene import Scene
 from sceneprior.core.shards import Shard, iterate_rooms, list_shards
+from sceneprior.evaluation.metric import EMPTY
 from sceneprior.evaluation.page import data_uri, png_uri, write_page
 from sceneprior.evaluation.score_table import (
     RELATION_HEADINGS,
@@ -154,6 +155,8 @@ def percent(share: float) -> str:
     >>> [percent(share) for share in (1.0, 0.9999, 0.995, 0.0001, 0.0)]
     ['100%', 'over 99.9%', '99.5%', 'under 0.1%', '0%']
     """
+    if share < 0:  # of a gap that became wider
+        return "below 0%"
     if share in (0, 1):
         return f"{share:.0%}"
     if 0 < share < 0.0005:
@@ -162,10 +165,15 @@ def percent(share: float) -> str:
 
 
 def _tiles(scores: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """(value, caption, reference values) of the tiles at the top of the page, for known keys."""
-    tile = _Tile()
+    """(value, caption, reference values) of the tiles at the top of the page, for known keys. If
+    most rooms are empty, only their number of objects has a meaning."""
+    tile, is_empty = _Tile(), EMPTY in scores.get("note", "")
     tiles = [
-        (tile.format(value, scores[key]), what, tile.format(beside, **scores))
+        (
+            tile.format("–" if is_empty and key != "mean_objects" else value, scores[key]),
+            what,
+            tile.format(beside, **scores),
+        )
         for key, value, what, beside in _TILES
         if scores.get(key) is not None
     ]

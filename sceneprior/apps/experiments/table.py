@@ -23,7 +23,7 @@ from sceneprior.apps.experiments.comparison import (
     variants_of,
 )
 from sceneprior.core.files import write_whole
-from sceneprior.evaluation.metric import ARROWS, TableColumn
+from sceneprior.evaluation.metric import ARROWS, EMPTY, TableColumn
 from sceneprior.evaluation.metrics import DECODED, METRICS
 from sceneprior.evaluation.score_table import Scores
 from sceneprior.evaluation.view_scores import ViewScores
@@ -34,7 +34,8 @@ from sceneprior.training.method import read_checkpoint
 Result = dict[str, Any]
 """Values by key of a result, with its protocol, reference rows and the costs of training."""
 
-GAP = "–"
+GAP, FEW = "–", 50
+"""An unknown value, and the number of test rooms below which a table warns."""
 DECODED_ROOMS = "of training rooms, decoded"
 GROUPS = {
     "paper": "rooms of new latents (paper)",
@@ -138,12 +139,23 @@ def _rows_of_rooms(
         for variant, scores in found.items()
     ]
     first, last = rows[0][2], rows[-1][0]
-    if decoded := first.get("decoded_rooms"):
+    rows = [(variant, origin, _of_set(scores, "generated")) for variant, origin, scores in rows]
+    if first.get("decoded_rooms"):
         # The last variant decodes latents; a sampler, which decodes no room, would come first.
-        rows.append((last, DECODED_ROOMS, {**decoded, "protocol": first["protocol"]}))
+        rows.append((last, DECODED_ROOMS, _of_set(first, "decoded_rooms")))
     for variant, origin, scores in rows:
         group = GROUPS[origin].format(learns_from)
         yield variant, marked(origin), scores, group, list(GROUPS).index(origin)
+
+
+def _of_set(scores: Result, name: str) -> Result:
+    """The values of a set of rooms with their intervals; of generated rooms, the whole result."""
+    found = scores.get(name, {})
+    if name == "generated":
+        sets = [key for key in NEW_ROOMS.references.values() if key in scores]
+        found = scores | {key: _of_set(scores, key) for key in sets}
+    intervals = scores.get("intervals", {}).get(name, {})
+    return {**found, "intervals": intervals, "protocol": scores["protocol"]}
 
 
 def _rows_of_views(
@@ -164,10 +176,7 @@ def _rows_of_views(
 
 
 def costs_of(run: Run) -> dict[str, int | float | None]:
-    """Costs of training: `cpu_s`, `steps` and `parameters`.
-
-    CPU seconds are None if they are unknown, since training was killed or started by hand.
-    """
+    """Costs of training; CPU seconds are None if training was killed or started by hand."""
     steps = 0
     for final in (run.folder / "run").glob("*/final.ckpt"):
         saved = read_checkpoint(final)
@@ -187,7 +196,7 @@ def costs_of(run: Run) -> dict[str, int | float | None]:
 def markdown(rows: Sequence[Row], form: Form) -> str:
     """A Markdown table for each kind of rooms, with methods under the headings of their groups."""
     tables = [
-        f"### {own[0].rooms}\n\n{_caption(own, form)}\n\n"
+        f"### {own[0].rooms}\n\n{_warnings(own)}{_caption(own, form)}\n\n"
         + "\n".join(f"| {' | '.join(cells)} |" for cells in _lines(own, form))
         for own in _by(rows, "rooms")
     ]
@@ -197,14 +206,17 @@ def markdown(rows: Sequence[Row], form: Form) -> str:
 
 
 def as_csv(rows: Sequence[Row], form: Form) -> str:
-    """One line per run and variant, with unrounded numbers."""
+    """One line per run and variant, with unrounded numbers, and the 95% intervals at the end."""
     keys = [*form.columns, *COSTS]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["rooms", "group", "method", "made by", form.variant, "seed", *keys])
+    ends = [f"{key} {end}" for key in form.columns for end in ("from", "to")]
+    writer.writerow(["rooms", "group", "method", "made by", form.variant, "seed", *keys, *ends])
     for row in rows:
         named = [row.rooms, row.group, row.title, row.made_by, row.variant, row.seed]
-        writer.writerow([*named, *(row.scores.get(key) for key in keys)])
+        intervals = row.scores.get("intervals", {})
+        between = [end for key in form.columns for end in intervals.get(key) or (None, None)]
+        writer.writerow([*named, *(row.scores.get(key) for key in keys), *between])
     return text.getvalue()
 
 
@@ -252,6 +264,17 @@ def _by(rows: Sequence[Row], *names: str) -> list[list[Row]]:
     for row in rows:
         groups.setdefault(tuple(getattr(row, name) for name in names), []).append(row)
     return list(groups.values())
+
+
+def _warnings(rows: Sequence[Row]) -> str:
+    """Paragraphs on what makes a table's values uncertain or meaningless."""
+    count, found = rows[0].scores["protocol"].get("n_test", FEW), dict[str, None]()
+    if count < FEW:
+        found[f"with {count} test rooms, rows whose intervals overlap cannot be told apart"] = None
+    for row in rows:
+        if EMPTY in (note := row.scores.get("note", "")):
+            found[f"'{row.title}', {row.variant}: {note.partition(':')[0]}"] = None
+    return "".join(f"**Warning:** {each}.\n\n" for each in found)
 
 
 def _caption(rows: Sequence[Row], form: Form) -> str:

@@ -114,7 +114,7 @@ class Explorer:
         """Each clause of the state's request, and whether the shown room meets it."""
         if not shown.line:
             return []
-        given, found = RoomRequest(objects=shown.request.objects), []
+        given, found = RoomRequest(objects=shown.request.objects), list[tuple[str, bool]]()
         whole = self.understood(shown.request).wishes.bounds
 
         def is_understood(text: str) -> bool:
@@ -123,19 +123,25 @@ class Explorer:
             return False
 
         for text in clauses_of(shown.line, is_understood):
-            asked = self.understood(read_line(text, given))
-            # Of two clauses about a class, the numbers are added.
-            counts = tuple(
-                replace(wish, most=None) if whole[wish.label][1] > (wish.most or 0) else wish
-                for wish in asked.wishes.counts
-            )
-            asked = replace(asked, wishes=replace(asked.wishes, counts=counts))
-            found.append((text, self._holds(shown.scene, asked)))
+            holds = False
+            with contextlib.suppress(InputError):  # a clause may need the others
+                asked = self.understood(read_line(text, given))
+                # Of two clauses about a class, the numbers are added.
+                counts = tuple(
+                    replace(wish, most=None)
+                    if whole.get(wish.label, (0, 0))[1] > (wish.most or 0)
+                    else wish
+                    for wish in asked.wishes.counts
+                )
+                asked = replace(asked, wishes=replace(asked.wishes, counts=counts))
+                holds = self._holds(shown.scene, asked)
+            found.append((text, holds))
         return found
 
     def _holds(self, scene: Scene, asked: Conditions) -> bool:
         fronts = np.zeros((len(scene.objects), 2))  # drawn objects have yaws of their own
-        return all(each["holds"] for each in answers(scene, asked, fronts))
+        found = answers(scene, asked, fronts)
+        return all(each["holds"] for each in found if not each.get("implied"))
 
     def sample(
         self,

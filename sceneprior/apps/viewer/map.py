@@ -2,10 +2,10 @@
 
 import re
 from dataclasses import dataclass
+from importlib.resources import files
 
 import torch
 from jaxtyping import Float, Int
-from markupsafe import Markup
 from torch import Tensor
 
 from sceneprior.core.errors import InputError
@@ -21,24 +21,9 @@ SNAP = 0.02
 Point = tuple[float, float]
 """A point of the map."""
 _EVENT = re.compile(r"([01](?:\.\d+)?) ([01](?:\.\d+)?) (click|drag|end) \d+")
-# viser's plots and pictures send no pointer events. The picture writes them into the text field
+# viser's plots and pictures send no pointer events. This picture writes them into the text field
 # that follows it, in the way that React listens to, and the field sends its text to the server.
-_SEND = (
-    "const b=this.getBoundingClientRect(),"
-    "s=(v,l)=>Math.min(1,Math.max(0,v/l)).toFixed(4),"
-    "i=this.parentElement.nextElementSibling.querySelector('input');"
-    "Object.getOwnPropertyDescriptor(HTMLInputElement.prototype,'value').set.call(i,"
-    "`${s(event.clientX-b.left,b.width)} ${s(b.bottom-event.clientY,b.height)} ${how} "
-    "${Math.round(event.timeStamp)}`);i.dispatchEvent(new Event('input',{bubbles:true}))"
-)
-_PICTURE = Markup(
-    '<svg class="sp-map" viewBox="0 0 100 100" '
-    "onpointerdown=\"this.setPointerCapture(event.pointerId);this.dataset.how='click'\" "
-    "onpointermove=\"if(event.buttons&1){{const how='drag';this.dataset.how='end';{send}}}\" "
-    'onpointerup="const how=this.dataset.how;{send}">{path}{dots}<circle class="sp-here" r="2.2"/>'
-    "</svg>"
-)
-_DOT = Markup('<circle cx="{:.1f}" cy="{:.1f}" r="0.9"/>')
+_PICTURE = files("sceneprior.apps.viewer").joinpath("map.svg").read_text()
 
 
 @dataclass(frozen=True)
@@ -117,25 +102,22 @@ def make_map(space: LatentSpace, z: Float[Tensor, "rooms dimension"]) -> LatentM
     return LatentMap(space, axes, rooms, share, (x, y), side)
 
 
-def map_picture(
-    latent_map: LatentMap, path: Float[Tensor, "steps dimension"] | None = None
-) -> Markup:
+def map_picture(latent_map: LatentMap, path: Float[Tensor, "steps dimension"] | None = None) -> str:
     """The picture of a map as SVG, with a dot for each training room and the line of a path."""
-    line = Markup()
+    places = _on_picture(latent_map, latent_map.rooms)
+    drawn = "".join(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="0.9"/>' for x, y in places)
     if path is not None:
         points = " ".join(f"{x:.1f},{y:.1f}" for x, y in _on_picture(latent_map, path))
-        line = Markup('<polyline points="{}"/>').format(points)
-    dots = Markup().join(_DOT.format(x, y) for x, y in _on_picture(latent_map, latent_map.rooms))
-    return _PICTURE.format(send=Markup(_SEND), path=line, dots=dots)
+        drawn = f'<polyline points="{points}"/>{drawn}'
+    return _PICTURE.replace("<!-- rooms -->", drawn)
 
 
-def mark_style(latent_map: LatentMap, z: Float[Tensor, " dimension"] | None) -> Markup:
+def mark_style(latent_map: LatentMap, z: Float[Tensor, " dimension"] | None) -> str:
     """The style that moves the picture's mark to a latent; None hides the mark."""
     if z is None:
-        return Markup("<style>.sp-here {display: none}</style>")
+        return "<style>.sp-here {display: none}</style>"
     ((x, y),) = _on_picture(latent_map, z.unsqueeze(0))
-    style = Markup("<style>.sp-here {{transform: translate({:.2f}px, {:.2f}px)}}</style>")
-    return style.format(x, y)
+    return f"<style>.sp-here {{transform: translate({x:.2f}px, {y:.2f}px)}}</style>"
 
 
 def read_event(latent_map: LatentMap, text: str) -> tuple[Point, str] | None:

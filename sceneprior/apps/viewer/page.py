@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from sceneprior.apps.retrieval.cad_models import CadModels, made_models
 from sceneprior.apps.viewer.explorer import Explorer
-from sceneprior.apps.viewer.shown import NOTHING_ASKED, Display, Folder, Shown, name_and_size
+from sceneprior.apps.viewer.shown import NOTHING_ASKED, Folder, Shown, name_and_size
 from sceneprior.apps.viewer.views import FOV_RAD, VIEWS, View, overview, room_points, walker
 from sceneprior.core.boxes import BOX_EDGES, box_corners
 from sceneprior.core.errors import InputError
@@ -48,9 +48,11 @@ class Page:
         shell: ShellName = "walls",
     ):
         self.server, self.source, self.models = server, source, models or made_models()
-        self.display = Display(shell)
-        is_folder = isinstance(source, Folder)
-        self.shown = source.room(0) if is_folder else source.sample(0, None, request)
+        self.shell, self.names, self.boxes = shell, False, False
+        """Parts of the shell that are shown, a grid if none is; and choices to show names and boxes
+        of all objects."""
+        first = source.room(0) if isinstance(source, Folder) else source.sample(0, None, request)
+        self.shown = first
         self.before: list[Shown] = []
         """States to which `undo` returns, the newest last."""
         self._settled = self.shown
@@ -117,11 +119,11 @@ class Page:
 
     def _draw(self) -> None:
         """Replace the nodes of the room."""
-        scene, display = self.shown.scene, self.display
+        scene = self.shown.scene
         before, self._nodes = self._nodes, {}
         shell = shell_of(scene)
-        is_walled = display.shell == "walls"
-        meshes = shell.inner_meshes() if is_walled else shell_meshes(scene, display.shell)
+        is_walled = self.shell == "walls"
+        meshes = shell.inner_meshes() if is_walled else shell_meshes(scene, self.shell)
         self._grid.visible = not meshes
         for name, part in meshes.items():
             self._mesh(name, part.vertices_m, part.faces, tuple(shell_color(name).tolist()))
@@ -140,7 +142,7 @@ class Page:
         )  # fmt: skip
         return node
 
-    def _lines(self, name: str, segments_m: Any, color: Any, thickness: float = 2) -> None:
+    def _lines(self, name: str, segments_m: Any, color: Any, thickness: int = 2) -> None:
         self._nodes[name] = self.server.scene.add_line_segments(
             f"/room/{name}", np.asarray(segments_m), color, thickness=thickness,
             thickness_units="screen",
@@ -170,7 +172,7 @@ class Page:
         """An object, which a click picks and a drag moves. A picked or locked one has a name and a
         box."""
         scene, shown = self.shown.scene, self.shown
-        item, display = scene.objects[row], self.display
+        item = scene.objects[row]
         mesh, is_picked, is_locked = object_mesh(item), row == shown.picked, row in shown.locked
         node = self._mesh(
             f"object_{row}", mesh.vertices_m, mesh.faces, color, side="double", cast_shadow=True,
@@ -178,13 +180,13 @@ class Page:
         )  # fmt: skip
         node.on_click(lambda _: self.safely(lambda: self.pick(row)))
         node.on_drag("left")(self._dragger(row))
-        if display.names or is_picked or is_locked:
+        if self.names or is_picked or is_locked:
             (x, y, z), lock = item.center_m, "🔒 " * is_locked
             self._nodes[f"name_{row}"] = self.server.scene.add_label(
                 f"/room/name_{row}", lock + name_and_size(item), anchor="bottom-center",
                 position=(x, y + item.size_m[1] / 2 + 0.05, z),
             )  # fmt: skip
-        if display.boxes or is_picked or is_locked:
+        if self.boxes or is_picked or is_locked:
             (corners,) = box_corners(scene.centers_m[[row]], scene.sizes_m[[row]])
             box_color = _LOCKED if is_locked else _PICKED if is_picked else _BOX
             self._lines(f"box_{row}", corners[np.array(BOX_EDGES)], box_color)
@@ -228,7 +230,7 @@ class Page:
 
     # -- Cameras -------------------------------------------------------------------------------
 
-    def look(self, view: View, client: "viser.ClientHandle") -> None:
+    def look(self, view: View, client: Any) -> None:
         """Show the room from outside, from above, or from inside, in one browser."""
         self._views[client.client_id] = view
         self._frame(client)
@@ -258,7 +260,7 @@ class Page:
             if view == "Walk in":
                 camera.position, camera.look_at = walker(self.shown.scene)
             else:
-                points_m = room_points(self.shown.scene, self.display.shell == "walls")
+                points_m = room_points(self.shown.scene, self.shell == "walls")
                 camera.position, camera.look_at = overview(
                     points_m, view, camera.image_width, camera.image_height
                 )

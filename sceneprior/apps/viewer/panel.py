@@ -114,7 +114,7 @@ class Panel:
         if self._mark is not None and isinstance(source, Explorer) and source.map is not None:
             latent = shown.scene.latent
             z = None if latent is None else torch.from_numpy(latent)
-            self._mark.content = str(mark_style(source.map, z))
+            self._mark.content = mark_style(source.map, z)
 
     # -- Rooms ---------------------------------------------------------------------------------
 
@@ -224,7 +224,7 @@ class Panel:
         gui, page, latent_map = self._gui, self.page, explorer.map
         assert latent_map is not None, "callers ask first"
         self._mark = gui.add_html("")
-        self._map = gui.add_html(str(map_picture(latent_map)))
+        self._map = gui.add_html(map_picture(latent_map))
         sent: Any = gui.add_text("", "")
         tell = self._said()
         self._text(
@@ -258,7 +258,7 @@ class Panel:
         def draw() -> None:
             z = explorer.draw_path(page.shown, start.value, end.value)
             if explorer.map is not None:
-                self._map.content = str(map_picture(explorer.map, z))
+                self._map.content = map_picture(explorer.map, z)
             step.disabled = False
             step.value = 0
             self._show_decoded(explorer.step(0), True)
@@ -278,7 +278,7 @@ class Panel:
     def _add_view(self) -> None:
         gui, page = self._gui, self.page
         choice = gui.add_dropdown(
-            "Shell", SHELLS, initial_value=page.display.shell,
+            "Shell", SHELLS, initial_value=page.shell,
             hint="Floor and walls, the floor, or neither; in downloads, too",
         )  # fmt: skip
         self._choice("shell", choice)
@@ -290,7 +290,7 @@ class Panel:
         page = self.page
 
         def chosen() -> None:
-            setattr(page.display, name, value_of(control))
+            setattr(page, name, value_of(control))
             page.show(page.shown, remember=False)
 
         control.on_update(lambda _: page.safely(chosen))
@@ -301,7 +301,7 @@ class Panel:
         tell = self._said()
 
         def send(client: Any) -> None:
-            shown, shell = self.page.shown.scene, self.page.display.shell
+            shown, shell = self.page.shown.scene, self.page.shell
             name, content, notes = download(shown, value_of(form), shell)
             client.send_file_download(name, content, save_immediately=True)
             tell(" ".join(notes))

@@ -11,7 +11,7 @@ from sceneprior.lifted.requests.wishes import Wishes, read_wishes
 
 _KEYS = {"floor": "floor", "doors": "openings", "ceiling": "ceiling_m"}
 """Parts of a request beside its sentence: `floor: 0,0 5,0 5,3; doors: door@0:1; two beds`."""
-_BETWEEN = re.compile(r",|\.(?=\s|$)|\band\b|\bwith\b")
+_BETWEEN = re.compile(r"\s*(,|\.(?=\s|$)|\band\b|\bwith\b)\s*")
 """Text between the clauses of a sentence."""
 
 
@@ -67,17 +67,22 @@ def sentence_of(wishes: Wishes) -> str:
 
 def clauses_of(line: str, is_understood: Callable[[str], bool]) -> list[str]:
     """The clauses of a line. One that is not understood by itself, such as "two nightstands beside
-    it", is joined to the one before it."""
+    it", is joined to the one before it.
+
+    >>> clauses_of("floor: 4x3; a bed with a view, and a desk", lambda text: text != "a view")
+    ['floor: 4x3', 'a bed with a view', 'a desk']
+    """
     clauses: list[str] = []
     for piece in line.split(";"):
         if _keyed(piece)[0] is not None:
             clauses.append(piece.strip())
             continue
         own: list[str] = []
-        for text in filter(None, map(str.strip, _BETWEEN.split(piece))):
-            if own and not is_understood(text):
-                own[-1] += f" and {text}"
-            else:
+        found = _BETWEEN.split(piece.strip())
+        for between, text in zip(["", *found[1::2]], found[::2], strict=True):
+            if text and own and not is_understood(text):
+                own[-1] += f"{' ' * between.isalpha()}{between} {text}"
+            elif text:
                 own.append(text)
         clauses += own
     return clauses

@@ -35,17 +35,6 @@ def name_and_size(item: SceneObject) -> str:
     return item.label.replace("_", " ") + " {:.2f} x {:.2f} x {:.2f} m".format(*item.size_m)
 
 
-@dataclass
-class Display:
-    """Choices of what is shown with a room."""
-
-    shell: ShellName
-    """Parts of the room itself. If neither floor nor walls are shown, a grid is."""
-    names: bool = False
-    """Names and sizes of all objects."""
-    boxes: bool = False
-
-
 @dataclass(frozen=True)
 class Shown:
     """The page's state: the shown room, and the request that it answers or that the next one

@@ -10,13 +10,10 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Scene
 from sceneprior.render.appearance import object_colors
 
-_TEXT = Markup('<div style="padding: 0 0.8em 0.6em; font-size: 0.9em">{}</div>')
-_LIST = Markup('<ul style="margin: 0.3em 0 0; padding: 0; list-style: none">{}</ul>')
-_SWATCH = Markup(
-    '<span style="display: inline-block; width: 0.8em; height: 0.8em; margin-right: 0.5em; '
-    'border-radius: 2px; background: rgb({}, {}, {})"></span>'
-)
-WORSE = Markup('<span role="alert" style="color: #b02020">{}</span>')
+_TEXT = Markup('<div class="sp-text">{}</div>')
+_LIST = Markup('<ul class="sp-list">{}</ul>')
+_SWATCH = Markup('<span class="sp-swatch" style="background: rgb({}, {}, {})"></span>')
+WORSE = Markup('<span class="sp-worse" role="alert">{}</span>')
 
 
 def value_of(control: Any) -> Any:

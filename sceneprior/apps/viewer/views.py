@@ -50,23 +50,15 @@ def walker(scene: Scene) -> Camera:
     """The camera of a walker, who stands in a door, or else in a corner, where there is most space,
     and looks across the room."""
     shell = shell_of(scene)
-    middle = shell.outline_m.mean(axis=0)
-    doors = [
-        wall.start_m + wall.direction * (start + end) / 2 + wall.inward * STEP_M
-        for wall in shell.walls
-        for start, end, bottom, _ in wall.openings
-        if bottom < STEP_M
-    ]
-    corners = [
-        corner + 2 * STEP_M * (middle - corner) / np.linalg.norm(middle - corner)
-        for corner in shell.outline_m
-    ]
-
-    def space_m(place: np.ndarray) -> float:
-        apart = np.abs(scene.centers_m[:, [0, 2]] - place) - scene.sizes_m[:, [0, 2]] / 2
-        return float(apart.max(axis=1).min(initial=math.inf))
-
-    x, z = max(doors or corners, key=space_m)
+    middle, doors = shell.outline_m.mean(axis=0), list[np.ndarray]()
+    for wall in shell.walls:
+        for start, end, bottom, _ in wall.openings:
+            if bottom < STEP_M:
+                middle_m = wall.start_m + wall.direction * (start + end) / 2
+                doors.append(middle_m + wall.inward * STEP_M)
+    places = np.array(doors or shell.outline_m * 0.8 + middle * 0.2)
+    apart = np.abs(places[:, None] - scene.centers_m[:, [0, 2]]) - scene.sizes_m[:, [0, 2]] / 2
+    x, z = places[apart.max(axis=-1).min(axis=1, initial=math.inf).argmax()]
     return np.array([x, EYE_M, z]), np.array([middle[0], 1.1, middle[1]])
 
 

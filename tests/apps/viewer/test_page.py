@@ -17,7 +17,7 @@ from refusals import refused
 
 import sceneprior
 from sceneprior.apps.viewer.explorer import Explorer
-from sceneprior.apps.viewer.shown import FORMATS, Display, Folder, download
+from sceneprior.apps.viewer.shown import FORMATS, Folder, download
 from sceneprior.core.cameras import FILLED, framed, look_at
 from sceneprior.core.scene import Opening, Scene, SceneObject
 from sceneprior.core.shell import shell_of
@@ -242,7 +242,7 @@ def page_of(fake: FakeScene, scene: Scene, shell: str = "walls") -> pages.Page:
 def drawn(fake: FakeScene, scene: Scene, shell: str, chosen=None, **state):
     """The names of the nodes of a page's room."""
     page = page_of(fake, scene, shell)
-    page.display = Display(shell, **chosen or {})
+    vars(page).update(chosen or {})
     page.show(replace(page.shown, **state))
     return {name.removeprefix("/room/") for name in fake.nodes} - {"/sky", "/sun"}
 
