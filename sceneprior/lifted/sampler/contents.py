@@ -13,6 +13,9 @@ from sceneprior.lifted.sampler.frames import side_of
 
 END = 0
 """Class that ends a room's list: void, which no listed object has."""
+FEW = 5
+"""Number of training rooms in which two independent classes must be expected together, for none to
+mean that rooms have one or the other."""
 MANY = 3
 """Number of bits ("at least 1", "at least 2" and so on) that encode the count of a class, besides
 the count itself: the first object of a class is more informative than the next ones."""
@@ -43,14 +46,31 @@ class Contents(nn.Module):
     known: Tensor
     """True for the classes that may be sampled: those of the training rooms, and `END`."""
 
+    most: Tensor
+    """Largest number of each class in a training room."""
+    excluded: Tensor
+    """True for pairs of classes of which rooms have one or the other, such as two kinds of beds."""
+
     def __init__(self, classes: int, width: int, dropout: float):
         super().__init__()
         self.register_buffer("known", torch.zeros(classes, dtype=torch.bool))
+        self.register_buffer("most", torch.full((classes,), torch.inf))
+        self.register_buffer("excluded", torch.zeros(classes, classes, dtype=torch.bool))
         self.layers = nn.Sequential(
             nn.Linear((1 + MANY) * classes + 3, width), nn.ReLU(), nn.Dropout(dropout),
             nn.Linear(width, width), nn.ReLU(), nn.Dropout(dropout),
             nn.Linear(width, classes),
         )  # fmt: skip
+
+    def teach(self, counts: Float[Tensor, "rooms classes"]) -> None:
+        """Set the buffers from the numbers of each class in the training rooms."""
+        self.known.copy_((counts > 0).any(dim=0))
+        self.known[END] = True
+        self.most.copy_(counts.amax(dim=0))
+        self.most[END] = torch.inf
+        here = (counts > 0).to(counts)
+        each, together = here.sum(dim=0), here.T @ here
+        self.excluded.copy_((together == 0) & (each * each[:, None] > FEW * len(counts)))
 
     def forward(
         self, counts: Float[Tensor, "*batch classes"], extents_m: Float[Tensor, "*batch 2"]
@@ -93,15 +113,16 @@ class Contents(nn.Module):
         most: Float[Tensor, " classes"] | None = None,
     ) -> Int[Tensor, "rooms slots"]:
         """Sample the classes to add to the given `counts`, at most `free` of them, followed by
-        `END`. Classes of which there are `most` already are left out.
+        `END`. Classes of which there are `most` already are left out, and so are those of which no
+        training room has as many, or of which none has both it and a class that is there.
 
         The network was trained to continue any subset of a room's classes.
         """
+        most = self.most if most is None else torch.minimum(most, self.most)
         going, drawn = torch.ones_like(free, dtype=torch.bool), torch.zeros_like(uniform).long()
         for slot, chance in enumerate(uniform.unbind(dim=1)):
-            logits = self(counts, extents_m)
-            if most is not None:
-                logits = logits.masked_fill(counts >= most, -torch.inf)
+            barred = (counts >= most) | ((counts > 0).to(counts) @ self.excluded.to(counts) > 0)
+            logits = self(counts, extents_m).masked_fill(barred, -torch.inf)
             label = draw_index(logits, chance)
             going = going & (label != END) & (slot < free)
             drawn[:, slot] = label * going

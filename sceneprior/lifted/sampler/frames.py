@@ -10,12 +10,14 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sceneprior.core.boxes import QUARTERS, turn_boxes
 from sceneprior.lifted.prototypes import POSES, PosedRooms, turn_posed
 
+BESIDE_M = 0.4
+"""Largest gap between a piece and the larger one that it belongs to."""
 GRAZE_M = 0.05
 """Overlap along an axis up to which an intersection of lifted boxes is attributed to their
 inaccuracy."""
@@ -126,3 +128,36 @@ def turn_places(
     """Places (x, z) after their rooms are turned by `quarters`."""
     nothing = torch.zeros_like(place_m)
     return turn_rectangles(torch.cat([place_m, nothing], dim=-1), quarters)[:, :2]
+
+
+def mirror_images(
+    rooms: PosedRooms, label: Int[Tensor, " rooms"]
+) -> tuple[Float[Tensor, "rooms objects 2"], Bool[Tensor, "rooms objects"]]:
+    """Where the twin of each object of class `label` would stand: the centre (x, z) of its mirror
+    image about the nearest larger piece of another class, such as that of a nightstand about the
+    bed, or that of a chair about the table.
+
+    Returns:
+        The places, and whether each object has one: the class must be `label`, a larger piece must
+        stand within `BESIDE_M`, and no object of the class may stand at the image yet.
+    """
+    count = rooms.is_object.shape[1]
+    centre, extents = rooms.boxes_m.split(3, dim=-1)
+    away = centre.unsqueeze(1) - centre.unsqueeze(2)  # from each object to each other one
+    gaps = away.abs() - (extents.unsqueeze(1) + extents.unsqueeze(2)) / 2
+    centre, extents, away, level = centre[..., ::2], extents[..., ::2], away[..., ::2], gaps[..., 1]
+    area, labels = extents.prod(dim=-1), rooms.object_class
+    larger = (area.unsqueeze(1) > area.unsqueeze(2)) & (level < 0) & rooms.is_object.unsqueeze(1)
+    others = larger & (labels.unsqueeze(1) != labels.unsqueeze(2))
+    gap = gaps[..., ::2].amax(dim=-1).masked_fill(~others, torch.inf)
+    if not count:
+        return centre, rooms.is_object
+    least, beside = gap.min(dim=-1)
+    rows = torch.arange(len(away), device=away.device)[:, None], torch.arange(count), beside
+    # It moves along the axis on which the two are apart.
+    moves = gaps[..., ::2][rows] == least.unsqueeze(-1)
+    images = centre + 2 * away[rows] * moves
+    same = rooms.is_object & (labels == label.unsqueeze(1))
+    there = (images.unsqueeze(2) - centre.unsqueeze(1)).abs() < extents.unsqueeze(1) / 2
+    taken = (there.all(dim=-1) & same.unsqueeze(1)).any(dim=-1)
+    return images, same & (least < BESIDE_M) & ~taken

@@ -14,6 +14,7 @@ from sceneprior.core.mixtures import FIRST_SCALE, LogisticMixture
 from sceneprior.lifted.prototypes import PARTS, PosedRooms, turn_posed
 from sceneprior.lifted.sampler.frames import (
     gaps_to_sides_m,
+    mirror_images,
     shared_extents,
     side_of,
     turn_places,
@@ -37,10 +38,10 @@ BY_SIDES = 8
 """Number of anchors along an axis given by the room: a narrow and a wide one at each of four
 positions. These are flush with the lower side of the rectangle, flush with its upper side, in its
 middle, and at the origin, which is the middle of the floor."""
-BY_OBJECT = 7
+BY_OBJECT = 8
 """Number of anchors along an axis per object already placed: adjacent before it, flush with its
-lower side, centred, flush with its upper side, adjacent behind it, and `APART_M` before and behind
-it."""
+lower side, centred, flush with its upper side, adjacent behind it, `APART_M` before and behind it,
+and at its mirror image (`mirror_images`)."""
 APART_M = 0.4
 """Gap between an object and the two anchors apart from it."""
 SHARPNESS, SPREAD = 1.5, 0.7
@@ -51,8 +52,10 @@ GAPS_M = (-0.4, -0.15, -0.05, 0.0, 0.05, 0.15, 0.4, 1.0, 2.0)
 """Knots of `ramps` for gaps; negative gaps are overlaps."""
 OFFSETS_M = (-1.5, -0.7, -0.3, -0.1, -0.03, 0.03, 0.1, 0.3, 0.7, 1.5)
 """Knots of `ramps` for offsets of centres and sides."""
+NEAR_M = (0.05, 0.15, 0.5)
+"""Distances from a mirror image at which its features become 0."""
 OF_GAP, OF_OFFSET = len(GAPS_M) - 1, len(OFFSETS_M) - 1
-OF_OBJECT, OF_SIDES = OF_GAP + 3 * OF_OFFSET, 2 * OF_GAP
+OF_OBJECT, OF_SIDES = OF_GAP + 3 * OF_OFFSET + len(NEAR_M), 2 * OF_GAP
 """Number of features, along an axis, of the relation to an object, and of the relations to the two
 sides of the rectangle."""
 
@@ -77,7 +80,7 @@ class Anchors(NamedTuple):
     exists: Bool[Tensor, "rooms anchors"]
     """False for the anchors of padding."""
     kind: Int[Tensor, " anchors"]
-    """0 to 7 for anchors given by the room, 8 to 14 for anchors of an object."""
+    """0 to 7 for anchors given by the room, 8 to 15 for anchors of an object."""
 
 
 class Places(NamedTuple):
@@ -97,6 +100,9 @@ class Places(NamedTuple):
     meets: Bool[Tensor, "rooms objects"]
     """True for placed objects whose vertical extent overlaps with that of the object to be
     placed."""
+    images_m: Float[Tensor, "rooms objects 2"]
+    """Mirror image (x, z) of each placed object of the same class; see `mirror_images`."""
+    has_image: Bool[Tensor, "rooms objects"]
     quarters: Int[Tensor, " rooms"]
     """Quarter turns that take the room to the frame."""
 
@@ -135,6 +141,8 @@ class Places(NamedTuple):
         )
         shared = overlap_x * overlap_z / least.clamp(min=1e-6).unsqueeze(1)
         shared = (shared * self.meets.unsqueeze(1)).clamp(max=1).unsqueeze(-1)
+        # An object is near an image only if it is so along both axes.
+        relations_z[..., -len(NEAR_M) :] *= relations_x[..., -1:]
         sides = torch.cat([sides_x.expand_as(sides_z), sides_z], dim=-1)
         return self.placement.along_z(
             self, anchors, (relations_x, relations_z, shared.sqrt()), sides
@@ -153,12 +161,13 @@ class Places(NamedTuple):
             [-total, -difference, torch.zeros_like(total), difference, total,
              -total - APART_M, total + APART_M], dim=-1,
         )  # fmt: skip
-        beside = (centre.unsqueeze(-1) + away).flatten(1)
-        theirs = self.is_object.repeat_interleave(BY_OBJECT, dim=1)
+        beside = torch.cat([centre.unsqueeze(-1) + away, self.images_m[..., axis, None]], dim=-1)
+        theirs = self.is_object.unsqueeze(-1).repeat(1, 1, BY_OBJECT)
+        theirs[..., -1] &= self.has_image
         kinds = torch.arange(BY_SIDES + BY_OBJECT, device=size.device)
         return Anchors(
-            torch.cat([sides, beside], dim=1),
-            torch.cat([torch.ones_like(sides, dtype=torch.bool), theirs], dim=1),
+            torch.cat([sides, beside.flatten(1)], dim=1),
+            torch.cat([torch.ones_like(sides, dtype=torch.bool), theirs.flatten(1)], dim=1),
             torch.cat([kinds[:BY_SIDES], kinds[BY_SIDES:].repeat(centre.shape[1])]),
         )
 
@@ -171,7 +180,12 @@ class Places(NamedTuple):
         total, difference = ((theirs + size) / 2).unsqueeze(1), ((theirs - size) / 2).unsqueeze(1)
         gap = offset.abs() - total
         offsets = torch.stack([offset, offset - difference, offset + difference], dim=-1)
-        relations = [ramps(gap.unsqueeze(-1), GAPS_M), ramps(offsets, OFFSETS_M)]
+        from_image = (self.images_m[:, None, :, axis] - at_m.unsqueeze(-1)).abs().unsqueeze(-1)
+        near = (1 - from_image / from_image.new_tensor(NEAR_M)).clamp(min=0)
+        relations = [
+            ramps(gap.unsqueeze(-1), GAPS_M), ramps(offsets, OFFSETS_M),
+            near * self.has_image[:, None, :, None],
+        ]  # fmt: skip
         middle, extent = (self.rectangle_m[:, [at]] for at in (axis, 2 + axis))
         to_middle = at_m - middle
         sides = (
@@ -211,8 +225,9 @@ class AxisScore(nn.Module):
         self.dropout = nn.Dropout(dropout)
         self.out = nn.Linear(WIDTH, 3)
         scales_m = (
-            [NARROW_M, WIDE_M] * (BY_SIDES // 2) + [NARROW_M] * (BY_OBJECT - 2) + [WIDE_M] * 2
-        )
+            [NARROW_M, WIDE_M] * (BY_SIDES // 2)
+            + [NARROW_M] * (BY_OBJECT - 3) + [WIDE_M] * 2 + [NARROW_M]
+        )  # fmt: skip
         first = torch.tensor([math.log(scale_m / FIRST_SCALE) for scale_m in scales_m])
         self.first_log_scale: Tensor
         self.register_buffer("first_log_scale", first, persistent=False)
@@ -268,9 +283,9 @@ class Placement(nn.Module):
     Both factors are mixtures of logistics around anchors. The room gives anchors flush with a side
     of the rectangle, in the middle of the rectangle, and in the middle of the floor. Every object
     already placed gives anchors adjacent to it, flush with its sides, centred on it, and apart from
-    it. So an object can stand flush with a wall along one axis and adjacent to another object along
-    the other. The weight of an anchor depends on the neighbours of an object at the anchor
-    (`AxisScore`).
+    it, and one at its mirror image about the larger piece beside it. So an object can stand flush
+    with a wall along one axis and adjacent to another object along the other. The weight of an
+    anchor depends on the neighbours of an object at the anchor (`AxisScore`).
 
     Args:
         classes: Size of the label set.
@@ -332,9 +347,10 @@ class Placement(nn.Module):
         # True if the two overlap in height; x and z are set to 0, because they do not matter.
         level = centre * torch.tensor([0.0, 1.0, 0.0]).to(centre)
         meets = shared_extents(own_box, torch.cat([level, extents], dim=-1))[..., 1] > 0
+        images_m, has_image = mirror_images(before, label)
         return Places(
             self, label, before.object_class,
             self.dropout(torch.relu(self.own(own))), self.dropout(torch.relu(self.there(there))),
             size_m[:, ::2], rectangle_m, before.boxes_m[..., [0, 2, 3, 5]], before.is_object,
-            meets, quarters,
+            meets, images_m, has_image, quarters,
         )  # fmt: skip

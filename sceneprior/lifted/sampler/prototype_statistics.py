@@ -15,7 +15,6 @@ from torch import Tensor
 
 from sceneprior.core.boxes import QUARTERS
 from sceneprior.lifted.prototypes import POSES, PosedRooms, Prototypes
-from sceneprior.lifted.sampler.contents import END
 from sceneprior.lifted.sampler.network import RECTANGLES, SIZES, RoomSampler
 from sceneprior.lifted.sampler.rooms import SamplerRooms, frames_of
 
@@ -42,8 +41,7 @@ def teach(sampler: RoomSampler, rooms: SamplerRooms) -> None:
     sampler.look_shown[: len(looks)] = looks
     labels = torch.from_numpy(prototypes.object_class)
     sampler.look_class[: len(looks)] = labels.repeat_interleave(POSES)
-    sampler.contents.known[labels[labels >= 0]] = True
-    sampler.contents.known[END] = True
+    sampler.contents.teach(sampler.counts(rooms.rooms))
     sampler.may_meet.copy_(rooms.may_meet(len(sampler.may_meet)))
     here = rooms.rooms.is_object
     areas_m2 = rooms.rooms.boxes_m[here][:, [3, 5]].prod(dim=-1)

@@ -48,3 +48,20 @@ def test_lists_are_drawn_as_the_network_says(contents):
         label = torch.tensor([listed])
         likely = contents.negative_log_likelihood(label, label > 0, extents_m[:1])
         assert_close(share, (-likely[0]).exp(), atol=0.01, rtol=0)
+
+
+def test_no_room_has_more_of_a_class_or_of_rivals_than_training_rooms(contents):
+    """Beds of two kinds are rivals; of the third class, rooms have two at most."""
+    rooms = torch.zeros(40, CLASSES)
+    rooms[:20, 1], rooms[20:, 2], rooms[:, 4] = 1, 1, torch.arange(40) % 3
+    contents.teach(rooms)
+    uniform = torch.rand(2000, 9, generator=torch.Generator().manual_seed(1))
+    there, size_m = torch.zeros(2000, CLASSES), torch.full((2000, 2), 3.0)
+    listed = contents.draw(there, torch.full((2000,), 9), size_m, uniform)
+    counts = torch.nn.functional.one_hot(listed, CLASSES).sum(dim=1)
+    assert counts[:, 1:].amax(dim=0).tolist() == [1, 1, 0, 2]
+    assert not (counts[:, 1] * counts[:, 2]).any()
+    asked = contents.draw(
+        there, torch.full((2000,), 9), size_m, uniform, torch.tensor([9.0] * 4 + [0])
+    )
+    assert not (asked == 4).any(), "at most none is asked for"

@@ -7,7 +7,12 @@ from torch.testing import assert_close
 from sceneprior.core.boxes import QUARTERS, turn_boxes
 from sceneprior.lifted.prototypes import POSES, PosedRooms, turn_posed
 from sceneprior.lifted.sampler import placement as module
-from sceneprior.lifted.sampler.frames import turn_places, turn_rectangles
+from sceneprior.lifted.sampler.frames import (
+    BESIDE_M,
+    mirror_images,
+    turn_places,
+    turn_rectangles,
+)
 from sceneprior.lifted.sampler.placement import Placement, Places
 
 CLASSES, LOOKS = 4, 3 * POSES
@@ -35,7 +40,7 @@ def rooms_with(boxes_m: torch.Tensor, looks: torch.Tensor) -> PosedRooms:
 
 def distribution(placement: Placement, rooms: PosedRooms, look, size_m, rectangle_m) -> Places:
     shown = torch.rand(LOOKS, 67, generator=torch.Generator().manual_seed(1)).double()
-    label, counts = torch.full_like(look, 3), torch.ones(len(look), 2 * CLASSES).double()
+    label, counts = torch.ones_like(look), torch.ones(len(look), 2 * CLASSES).double()
     return placement(
         label, look, size_m, torch.full_like(size_m[:, 0], 0.1), rectangle_m, rooms, counts, shown,
         torch.tensor([0, 1, 3]),
@@ -90,6 +95,7 @@ def test_scores_are_those_of_plain_layers_on_joined_features(placement, given, a
         calls.append((*given, found))
 
     places = distribution(placement, *given)
+    assert places.has_image.any(), "so that images are among the features"
     with score.register_forward_hook(watched):
         places.log_prob(torch.rand(3, 2).double())
     (places, anchors, relations, sides, found), real = calls[0], places.is_object[:, None, :, None]
@@ -138,3 +144,57 @@ def test_draws_follow_the_density(placement, given, monkeypatch):
     assert float(drawn.mean()) == pytest.approx(
         wanted, abs=4 * float(drawn.std()) / len(drawn) ** 0.5 + 0.02
     )
+
+
+@pytest.mark.parametrize("quarters", range(QUARTERS))
+def test_images_are_those_found_object_by_object_and_turn_with_the_room(quarters):
+    rng = torch.Generator().manual_seed(quarters)
+    boxes_m = torch.rand(60, 5, 6, generator=rng).double()
+    boxes_m[..., [0, 2]] *= 2
+    is_object = torch.arange(5) < torch.randint(2, 6, (60, 1), generator=rng)
+    labels = torch.randint(1, 4, (60, 5), generator=rng) * is_object
+    rooms = PosedRooms(labels, is_object, boxes_m)
+    label = torch.ones(60, dtype=torch.int64)
+    by = torch.full((60,), quarters)
+    images_m, has_image = mirror_images(rooms.changed(lambda part: part), label)
+    turned_m, still = mirror_images(PosedRooms(labels, is_object, turn_boxes(boxes_m, by)), label)
+    assert_close(still, has_image)
+    assert_close(turned_m[still], turn_places(images_m.flatten(0, 1), by.repeat_interleave(5))[
+        has_image.flatten()
+    ])  # fmt: skip
+    for room in range(60):
+        own = [
+            (boxes_m[room, k, :3].numpy(), boxes_m[room, k, 3:].numpy(), int(labels[room, k]))
+            for k in range(int(is_object[room].sum()))
+        ]
+        twins = [k for k, (*_, kind) in enumerate(own) if kind == 1]
+        for k in range(5):
+            found = _image(own, k, twins) if k in twins else None
+            assert bool(has_image[room, k]) == (found is not None)
+            if found is not None:
+                assert_close(images_m[room, k].tolist(), found)
+    assert has_image.any()
+    assert not has_image[labels == 1].all()
+
+
+def _image(own, k, twins):
+    """The mirror image of object `k`, by its definition."""
+    centre, extents, _ = own[k]
+    best = None
+    for other, size, kind in own:
+        apart = abs(other - centre) - (size + extents) / 2
+        smaller = extents[0] * extents[2] < size[0] * size[2]
+        if kind != 1 and smaller and apart[1] < 0:
+            gap = max(apart[0], apart[2])
+            if best is None or gap < best[0]:
+                best = gap, (0 if apart[0] > apart[2] else 2), other
+    if best is None or best[0] >= BESIDE_M:
+        return None
+    _, axis, other = best
+    image = centre.copy()
+    image[axis] = 2 * other[axis] - centre[axis]
+    for twin in twins:
+        away = abs(own[twin][0] - image)
+        if (away[0] < own[twin][1][0] / 2) and (away[2] < own[twin][1][2] / 2):
+            return None
+    return [image[0], image[2]]
