@@ -10,17 +10,21 @@ from pkgutil import iter_modules
 from sceneprior.evaluation.metric import DEFINED, MATCHED, USED
 
 _MODULES = (
-    "picture_distances", "picture_classifiers", "layouts", "function", "contents", "placement",
+    "function", "picture_distances", "picture_classifiers", "layouts", "contents", "placement",
     "support", "navigation", "physics", "novelty",
 )  # fmt: skip
 """Modules in the order in which tables show their metrics; other modules follow."""
+_STARTS = list[int]()
 for _name in dict.fromkeys((*_MODULES, *(found.name for found in iter_modules(__path__)))):
+    _STARTS.append(len(DEFINED))
     import_module(f"{__name__}.{_name}")
 
 _NETWORKS = ("inception", "alexnet", "effnet_lite0", None)
-_SORTED = sorted(DEFINED, key=lambda metric: _NETWORKS.index(metric.network))
+_SORTED = DEFINED[: _STARTS[1]]
+"""What a person checks first comes first; then metrics of pictures by network, then the rest."""
+_SORTED += sorted(DEFINED[_STARTS[1] :], key=lambda metric: _NETWORKS.index(metric.network))
 METRICS = tuple(metric for metric in _SORTED if metric.sets not in (MATCHED, USED))
-"""Metrics of sets of rooms, sorted by network; metrics that read no pictures come last."""
+"""Metrics of sets of rooms: function, pictures, then the rest."""
 DECODED = tuple(metric for metric in _SORTED if metric.sets == MATCHED)
 """Metrics of decoded training rooms against their ground truth."""
 USE = tuple(metric for metric in _SORTED if metric.sets == USED)

@@ -53,8 +53,7 @@ class Contents(nn.Module):
 
     def __init__(self, classes: int, width: int, dropout: float):
         super().__init__()
-        self.register_buffer("known", torch.zeros(classes, dtype=torch.bool))
-        self.register_buffer("most", torch.full((classes,), torch.inf))
+        self.register_buffer("most", torch.zeros(classes))
         self.register_buffer("excluded", torch.zeros(classes, classes, dtype=torch.bool))
         self.layers = nn.Sequential(
             nn.Linear((1 + MANY) * classes + 3, width), nn.ReLU(), nn.Dropout(dropout),
@@ -64,10 +63,8 @@ class Contents(nn.Module):
 
     def teach(self, counts: Float[Tensor, "rooms classes"]) -> None:
         """Set the buffers from the numbers of each class in the training rooms."""
-        self.known.copy_((counts > 0).any(dim=0))
-        self.known[END] = True
         self.most.copy_(counts.amax(dim=0))
-        self.most[END] = torch.inf
+        self.most[END] = 1
         here = (counts > 0).to(counts)
         each, together = here.sum(dim=0), here.T @ here
         self.excluded.copy_((together == 0) & (each * each[:, None] > FEW * len(counts)))
@@ -80,7 +77,7 @@ class Contents(nn.Module):
         reached = (counts.unsqueeze(-1) >= many).to(counts).flatten(-2)
         told = [counts, reached, counts.sum(dim=-1, keepdim=True), extents_m]
         logits: Tensor = self.layers(torch.cat(told, dim=-1))
-        return logits.masked_fill(~self.known, -torch.inf)
+        return logits.masked_fill(self.most == 0, -torch.inf)
 
     def negative_log_likelihood(
         self,
@@ -101,7 +98,7 @@ class Contents(nn.Module):
         self, object_class: Int[Tensor, "rooms objects"], is_object: Bool[Tensor, "rooms objects"]
     ) -> Float[Tensor, "rooms steps classes"]:
         """Counts of each class before each step; the last step counts all objects."""
-        each = F.one_hot(object_class, len(self.known)) * is_object.unsqueeze(-1)
+        each = F.one_hot(object_class, len(self.most)) * is_object.unsqueeze(-1)
         return F.pad(each.cumsum(dim=1), (0, 0, 1, 0)).to(next(self.parameters()))
 
     def draw(

@@ -13,7 +13,7 @@ CLASSES, SLOTS = 5, 4
 def contents(torch_rng) -> Contents:
     """A model of four classes, one of which is unknown."""
     found = Contents(CLASSES, 16, 0.0).eval()
-    found.known[[END, 1, 2, 4]] = True
+    found.most[[END, 1, 2, 4]] = SLOTS
     return found
 
 
