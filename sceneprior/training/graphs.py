@@ -73,7 +73,9 @@ def captured(function: Function, samples: tuple[Tensor, ...]) -> Function:
     # Weights that autocast has converted would be read from its cache, and never again converted.
     precision = torch.get_autocast_dtype("cuda"), torch.is_autocast_enabled("cuda")
     try:
-        with torch.autocast("cuda", *precision, cache_enabled=False):
+        with torch.autocast("cuda", *precision, cache_enabled=False), warnings.catch_warnings():
+            # The step that is under way keeps nodes of its own stream; samples have others.
+            warnings.filterwarnings("ignore", "The AccumulateGrad node's stream")
             return torch.cuda.make_graphed_callables(function, samples, allow_unused_input=True)
     except Exception:
         # A capture that fails leaves its stream current, and the generator unusable.
