@@ -24,6 +24,9 @@ TRIES = 4
 whose likely places are taken would end up at an unlikely one."""
 NUMBERS = 3 + 4 * TRIES
 """Uniform random numbers of a particle in a step."""
+LOOK_SHARPNESS, TWINS_SHARPNESS = 1.5, 3.0
+"""Powers to which the probabilities of looks are raised, of a class's first object and of the next
+ones, which mostly look alike; see `SHARPNESS` of places."""
 CANDIDATES = 128
 """Places in the whole room that are tried for a required object without a drawn place."""
 COMPARED = 16
@@ -222,8 +225,11 @@ class _Step:
         each is placed, in proportion to the areas of those in which it fits."""
         sampler, plans = self.particles.sampler, self.particles.plans
         label, pieces_m, ceiling_m = self.label[at], plans.pieces_m[self.room[at]], plans.ceiling_m
-        look = draw_index(self.logits[at], uniform[:, 0])
-        size_m, bottom_m = sampler.draw_size(look, uniform[:, 1])
+        before = self.state.before.changed(lambda part: part[at])
+        again = (before.is_object & (before.object_class == label[:, None])).any(dim=1)
+        sharpness = torch.where(again, TWINS_SHARPNESS, LOOK_SHARPNESS).unsqueeze(1)
+        look = draw_index(sharpness * self.logits[at], uniform[:, 0])
+        size_m, bottom_m = sampler.draw_size(look, before, uniform[:, 1])
         if ceiling_m is not None:
             highest_m = (ceiling_m - size_m[:, 1]).clamp(min=0)
             lower_m = torch.minimum(bottom_m, highest_m)

@@ -249,10 +249,13 @@ class RoomSampler(nn.Module):
         return logits.masked_fill(others, -torch.inf)
 
     def draw_size(
-        self, look: Int[Tensor, " rooms"], uniform: Float[Tensor, " rooms"]
+        self, look: Int[Tensor, " rooms"], before: PosedRooms, uniform: Float[Tensor, " rooms"]
     ) -> tuple[Float[Tensor, "rooms 3"], Float[Tensor, " rooms"]]:
         """Sample the extents of objects with these looks and the heights of their bottoms, in
         proportion to the numbers of training objects with them (`find_sizes`).
+
+        An object of the prototype of an object that is there (`before`) is its twin, as large and
+        as high; lifted twins differ by errors alone.
 
         An object above the floor, of a class that stands (`RARELY`), is the visible part of a
         higher one, such as a chair behind a table, and is extended to the floor.
@@ -265,7 +268,16 @@ class RoomSampler(nn.Module):
         above, every = numbers.new_zeros(2, len(self.footprints_m2)).index_add(1, labels, numbers)
         hidden = (bottom_m > HANGS_M) & (above < RARELY * every)[labels[prototype]]
         size_m[:, 1] += bottom_m * hidden
-        return _swapped(look, size_m), bottom_m * ~hidden
+        size_m, bottom_m = _swapped(look, size_m), bottom_m * ~hidden
+        assert before.looks is not None
+        twins = before.is_object & (before.looks // POSES == prototype.unsqueeze(1))
+        for row in twins.any(dim=1).nonzero()[:, 0].tolist():
+            twin = int(twins[row].int().argmax())
+            centre_m, extents_m = before.boxes_m[row, twin].split(3)
+            turns = before.looks[row, [twin]], look[[row]]
+            size_m[row] = _swapped(turns[1], _swapped(turns[0], extents_m[None]))[0]
+            bottom_m[row] = centre_m[1] - extents_m[1] / 2
+        return size_m, bottom_m
 
     def place(
         self,

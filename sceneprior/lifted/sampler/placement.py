@@ -44,7 +44,7 @@ lower side, centred, flush with its upper side, adjacent behind it, `APART_M` be
 and at its mirror image (`mirror_images`)."""
 APART_M = 0.4
 """Gap between an object and the two anchors apart from it."""
-SHARPNESS, SPREAD = 1.5, 0.7
+SHARPNESS, SPREAD = 2.0, 0.7
 """Sampling raises the weights of anchors to the power `SHARPNESS` and multiplies the scales by
 `SPREAD`, because distributions learnt from a few hundred rooms are broader than those of the
 rooms."""

@@ -9,7 +9,7 @@ from sceneprior.lifted.drawing import draw as module
 from sceneprior.lifted.drawing.draw import PLAIN, SampledRooms, draw_rooms
 from sceneprior.lifted.drawing.overlaps import INTERSECTING
 from sceneprior.lifted.drawing.plans import BEYOND_M
-from sceneprior.lifted.prototypes import PosedRooms
+from sceneprior.lifted.prototypes import POSES, PosedRooms
 from sceneprior.lifted.requests.floors import Floor, read_floor
 from sceneprior.lifted.requests.wishes import Conditions, CountWish, Wishes
 from sceneprior.lifted.sampler.frames import gaps_m, rectangles_of, shared_extents
@@ -70,6 +70,23 @@ def test_nothing_stands_in_what_it_may_not_or_sticks_out(sampler, wishes):
     assert pairs.any() and shares[pairs].max() <= INTERSECTING + 1e-6
     outer = rectangles_of(rooms)[rooms.is_object.any(dim=1)]
     assert (outer[:, :2].abs() + outer[:, 2:] / 2).max() <= 2 + BEYOND_M + 1e-5
+
+
+def test_objects_of_one_prototype_are_twins(sampler):
+    """As large and as high, each in its own pose."""
+    rooms, found = drawn(sampler, 60, 4, wishes=exactly(sofa=2, box=3)).rooms, 0
+    for room in range(60):
+        sizes: dict[int, list[list[float]]] = {}
+        for item in rooms.is_object[room].nonzero()[:, 0].tolist():
+            prototype, pose = divmod(int(rooms.looks[room, item]), POSES)
+            x, height, z = rooms.boxes_m[room, item, 3:].tolist()
+            bottom = float(rooms.boxes_m[room, item, 1]) - height / 2
+            own = [z, height, x, bottom] if pose % 2 else [x, height, z, bottom]
+            sizes.setdefault(prototype, []).append(own)
+        for first, *others in sizes.values():
+            found += len(others)
+            assert all(own == pytest.approx(first, abs=1e-5) for own in others)
+    assert found > 60
 
 
 def test_a_plan_that_nothing_comes_of_is_replaced(sampler, monkeypatch):
