@@ -42,6 +42,7 @@ LIVING_ROOMS: list[dict[str, Any]] = [
         SceneObject("sofa", (0.0, 0.4, -1.5), (1.9, 0.8, 0.9))]},
 ]  # fmt: skip
 PRIORS = {
+    "bedroom": BEDROOMS,
     "demo-bedroom": BEDROOMS,
     "procthor-bedroom": BEDROOMS,
     "procthor-living": LIVING_ROOMS,
