@@ -25,6 +25,7 @@ from sceneprior.core.classes import VOID
 from sceneprior.core.observations import RoomGroundTruth, RoomViews, observe
 from sceneprior.core.shards import Shard, list_shards
 from sceneprior.lifted.lifting.boxes import LiftedBoxes, lift_boxes
+from sceneprior.lifted.lifting.hidden_sides import planes_of
 
 UNKNOWN = -1
 HEADER = (
@@ -171,7 +172,9 @@ def score(views: RoomViews, truth: RoomGroundTruth, found: Found) -> Score:
     judged = (ids > 0) & (true > 0) & (true <= count)
     seen = observed(views, tracks.ids, tracks.object_class, poses)
     ideal = observed(views, ideal_ids(ids, views), views.object_class, poses)
-    iou, iou_true_ids = (_mean_iou(lift_boxes(each), truth, count) for each in (seen, ideal))
+    iou, iou_true_ids = (
+        _mean_iou(lift_boxes(each, planes_of((), None)), truth, count) for each in (seen, ideal)
+    )
     rand = rand_index(true[judged], np.maximum(tracks.ids[judged], 0))
     return Score(rand, len(seen.object_class), count, iou, iou_true_ids, found.seconds)
 

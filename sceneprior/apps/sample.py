@@ -64,9 +64,9 @@ def sample_rooms(
         try:
             return sample_scenes(trained, names, seed, request, classes, completes, with_models)
         except UnknownClassError as error:
-            if not (others := priors_that_draw(error.label)):
+            if not (drawn_by := priors_that_draw(error.label)):
                 raise
-            raise InputError(f"{error} It is drawn by {' and '.join(others)}.") from None
+            raise InputError(f"{error} It is drawn by {' and '.join(drawn_by)}.") from None
     if request is not None or classes is not None:
         others = "these rooms come from latents"
         if not isinstance(trained, TrainedPrior):

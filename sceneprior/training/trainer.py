@@ -108,7 +108,9 @@ def make_trainer(
             f"method: {config.method} trains in one process, but {trainer.world_size} were "
             "asked for; use --devices 1."
         )
-    if not trainer.fast_dev_run:  # opened last, since a run that is refused leaves no files behind
+    if not getattr(
+        trainer, "fast_dev_run", False
+    ):  # opened last, since a run that is refused leaves no files behind
         trainer.loggers = [make_logger(name, folder, config.logger.get(name)) for name in loggers]
     return trainer
 
@@ -160,8 +162,8 @@ def make_logger(name: str, folder: Path, given: dict[str, Any] | None = None) ->
     given = given or {}
     try:
         if name == "tensorboard":
-            tensorboard = {"name": "", "version": "", "default_hp_metric": False}
-            return TensorBoardLogger(folder, **tensorboard | given)
+            tensorboard: dict[str, Any] = {"name": "", "version": "", "default_hp_metric": False}
+            return TensorBoardLogger(folder, **(tensorboard | given))
         if name == "csv":
             # Lightning's CSVLogger deletes an existing file, so it is given its earlier rows.
             before = read_metrics(folder / "metrics.csv")
@@ -176,7 +178,11 @@ def make_logger(name: str, folder: Path, given: dict[str, Any] | None = None) ->
         inspect.signature(wandb.init).bind(**given)  # the logger itself would pass on any argument
         key = os.environ.get("WANDB_API_KEY") or Path("~/.netrc").expanduser().is_file()
         run = folder.parent.name
-        named = {"project": "sceneprior", "group": run, "name": f"{run}/{folder.name}"}
+        named: dict[str, Any] = {
+            "project": "sceneprior",
+            "group": run,
+            "name": f"{run}/{folder.name}",
+        }
         return WandbLogger(**named | {"save_dir": folder, "offline": not key} | given)
     except TypeError as error:
         raise ConfigError(f"logger.{name}: {cause_of(error)}.") from None

@@ -124,7 +124,10 @@ class Token(NamedTuple):
 
 def meanings_of(known: Sequence[str]) -> dict[str, tuple[str, Any]]:
     """The kind and the value of each phrase; later entries override earlier ones."""
-    nouns = {name.replace("_", " "): (name,) for names in LABEL_SETS.values() for name in names[1:]}
+    nouns: dict[str, tuple[str, ...]] = {}
+    nouns |= {
+        name.replace("_", " "): (name,) for names in LABEL_SETS.values() for name in names[1:]
+    }
     nouns |= {noun: classes for noun, classes in NOUNS.items() if noun not in known}
     nouns |= {name.replace("_", " "): (name,) for name in known}
     nouns |= {opening: (opening,) for opening in OPENINGS}
