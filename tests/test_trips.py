@@ -63,16 +63,16 @@ def test_a_mask_to_its_gradient(toy_shards):
         views = next(iter(make_loader(data, config.shape.batch_size, 0, 0)))
         module.training_step(views, 0).backward()
 
-    assert_short(files_of(trip), 23)
+    assert_short(files_of(trip), 25)
 
 
 def test_a_drawn_room_to_its_glb(prior, tmp_path):
     room = tmp_path / "room.glb"
-    assert_short(files_of(lambda: sceneprior.save(prior.sample(1)[0], room)), 27)
+    assert_short(files_of(lambda: sceneprior.save(prior.sample(1)[0], room)), 28)
 
 
 def test_a_wish_to_an_answer(prior):
-    assert_short(files_of(lambda: prior.sample(1, want="two nightstands")), 28)
+    assert_short(files_of(lambda: prior.sample(1, want="two nightstands")), 33)
 
 
 def test_a_recording_to_a_shard(tmp_path):

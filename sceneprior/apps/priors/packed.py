@@ -246,8 +246,8 @@ def shipped_priors() -> dict[str, Path]:
 def priors_that_draw(label: str) -> list[str]:
     """The shipped priors whose samplers draw a class.
 
-    >>> priors_that_draw("wardrobe")[:1]
-    ['demo-bedroom']
+    >>> priors_that_draw("wardrobe")
+    ['bedroom', 'demo-bedroom']
     """
     names = []
     for name, path in shipped_priors().items():

@@ -42,7 +42,7 @@ def test_damaged_shards_are_a_sentence_and_leave_no_run(command, toy_shards, tmp
 def test_options_that_lightning_refuses_are_a_sentence(command, toy_shards, tmp_path):
     call = ["fit", "--config", "paper/bedroom_small.yaml", "--run", "new", "--set"]
     said = one_sentence(command(*call, f"data.shards={toy_shards}", "--accelerator", "quantum"))
-    assert "Lightning cannot train with --devices auto, --accelerator quantum" in said
+    assert "Lightning cannot train with accelerator quantum: " in said
     assert not (tmp_path / "new").exists()
 
 
