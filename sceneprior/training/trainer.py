@@ -118,9 +118,10 @@ def make_trainer(
 @contextmanager
 def usage_errors(arguments: dict[str, Any], *others: type[Exception]) -> Iterator[None]:
     """Raise what Lightning says of its usage, taken ports, and `others` as an `InputError`."""
+    caught: tuple[type[Exception], ...] = (MisconfigurationException, ValueError, RuntimeError)
     try:
         yield
-    except (MisconfigurationException, ValueError, RuntimeError, *others) as error:
+    except caught + others as error:
         *_, (frame, _) = traceback.walk_tb(error.__traceback__)
         by_lightning = frame.f_globals.get("__name__", "").startswith("lightning.")
         loader, port = str(error).startswith("DataLoader"), isinstance(error, DistNetworkError)
