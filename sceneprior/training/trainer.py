@@ -108,10 +108,10 @@ def make_trainer(
             f"method: {config.method} trains in one process, but {trainer.world_size} were "
             "asked for; use --devices 1."
         )
-    if not getattr(
-        trainer, "fast_dev_run", False
-    ):  # opened last, since a run that is refused leaves no files behind
-        trainer.loggers = [make_logger(name, folder, config.logger.get(name)) for name in loggers]
+    if not getattr(trainer, "fast_dev_run", False):
+        # Opened last, since a run that is refused leaves no files behind.
+        given: Any = config.logger
+        trainer.loggers = [make_logger(name, folder, given.get(name)) for name in loggers]
     return trainer
 
 
