@@ -176,13 +176,17 @@ def test_the_room_follows_the_pointer_over_the_map_and_along_a_path(browser, toy
             return np.asarray(latent_map.axes) @ latent
 
         wait_for(lambda: np.abs(at() - goal).max() < 0.02 * latent_map.side, "not followed")
+        open_tab(browser, "Room")
         wait_for(lambda: page.shown.origin in words(browser), "the panel does not say so")
+        open_tab(browser, "Map")
         dot = browser.find_elements("css selector", "svg.sp-map circle")[5].rect
         move(browser, [(dot["x"] + dot["width"] / 2, dot["y"] + dot["height"] / 2)])
         wait_for(lambda: page.shown.origin.startswith("Training room"), "a dot is no room")
         open_tab(browser, "Path")
         click(browser, "Draw path")
+        open_tab(browser, "Room")
         wait_for(lambda: "Path, step 0 of 48" in words(browser), "no path")
+        open_tab(browser, "Map")
         assert browser.find_elements("css selector", "svg.sp-map polyline")
         log = [e["message"] for e in browser.get_log("browser") if e["level"] == "SEVERE"]
         assert [said for said in log if "passive event listener" not in said] == []
