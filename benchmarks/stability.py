@@ -30,9 +30,9 @@ def main() -> None:
         start = time.perf_counter()
         standing = [make_stable(room) for room in rooms]
         seconds = (time.perf_counter() - start) / len(rooms)
-        told = sum((changes for _, changes in standing), Counter[str]())
+        told = sum((each.changes for each in standing), Counter[str]())
         before = [settle(room) for room in rooms]
-        after = [settle(room) for room, _ in standing]
+        after = [settle(each.scene) for each in standing]
         print(
             f"{source}: {sum(len(room.objects) for room in rooms)} objects, stable as generated "
             f"{_share(before):.3f}, standing {_share(after):.3f}; deepest overlap at the start "
@@ -40,8 +40,8 @@ def main() -> None:
             f"{seconds:.3f} s a room to stand"
         )
         fallen = Counter(
-            room.objects[row].label
-            for (room, _), one in zip(standing, after, strict=True)
+            each.scene.objects[row].label
+            for each, one in zip(standing, after, strict=True)
             for row in np.flatnonzero(~one.stable)
         )
         if fallen:

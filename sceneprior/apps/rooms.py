@@ -20,7 +20,8 @@ from sceneprior.render.scene_files import check_names, format_of, save
 from sceneprior.render.topdown import perspective, view_of
 
 PAGE_FILE = "rooms.html"
-OVERVIEW_ROOMS = 12
+OVERVIEW_ROOMS = 24
+"""Most rooms that the overview shows."""
 OVERVIEW_TILE = (240, 320)
 """Height and width of one room of the overview, in pixels."""
 
@@ -53,8 +54,8 @@ def clear_scenes(folder: Path) -> None:
 def write_scenes(scenes: Sequence[Scene], folder: Path, shell: ShellName = "none") -> None:
     """Write scenes under their own names, replacing the scenes of a folder.
 
-    `overview.png` shows the first few, and `latents.npz` is written if all scenes are decoded from
-    latents.
+    `overview.png` shows all rooms, or the first `OVERVIEW_ROOMS` and says of how many;
+    `latents.npz` is written if all scenes are decoded from latents.
     """
     check_names(scenes)
     clear_scenes(folder)
@@ -63,7 +64,7 @@ def write_scenes(scenes: Sequence[Scene], folder: Path, shell: ShellName = "none
         done = pool.map(lambda scene: write_scene(scene, folder, scene.name, shell), scenes)
         for _ in bar.track(done, total=len(scenes), description="Writing scenes"):
             pass
-    sheet = overview(scenes[:OVERVIEW_ROOMS], shell)
+    sheet = overview(scenes, shell)
     write_whole(Path(folder) / "overview.png", png_bytes(sheet))
     write_latents(folder, scenes)
 
@@ -71,10 +72,13 @@ def write_scenes(scenes: Sequence[Scene], folder: Path, shell: ShellName = "none
 def overview(
     scenes: Sequence[Scene], shell: ShellName = "none"
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Contact sheet of one or more rooms from above a corner, four per row, coloured by class.
+    """Contact sheet of the first rooms from above a corner, four per row, coloured by class; its
+    first caption says how many there are if not all are shown.
 
     The walls behind the furniture are drawn if `shell` is `walls`, or the room has doors or
     windows; the floor is always drawn.
     """
-    tiles = [perspective(scene, view=view_of(scene, OVERVIEW_TILE, shell)) for scene in scenes]
-    return contact_sheet(tiles, min(4, len(tiles)))
+    shown = scenes[:OVERVIEW_ROOMS]
+    tiles = [perspective(scene, view=view_of(scene, OVERVIEW_TILE, shell)) for scene in shown]
+    captions = [f"The first {len(shown)} of {len(scenes)} rooms", *[""] * (len(shown) - 1)]
+    return contact_sheet(tiles, min(4, len(tiles)), captions if len(shown) < len(scenes) else ())

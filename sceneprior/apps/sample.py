@@ -64,9 +64,12 @@ def sample_rooms(
         try:
             return sample_scenes(trained, names, seed, request, classes, completes, with_models)
         except UnknownClassError as error:
-            if not (drawn_by := priors_that_draw(error.label)):
+            if not (others := priors_that_draw(error.label)):
                 raise
-            raise InputError(f"{error} It is drawn by {' and '.join(drawn_by)}.") from None
+            raise InputError(
+                f"'{error.label}' is not a class of this prior; shipped priors that draw it: "
+                f"{', '.join(others)} (--run {others[0]}). This one draws {', '.join(error.known)}."
+            ) from None
     if request is not None or classes is not None:
         others = "these rooms come from latents"
         if not isinstance(trained, TrainedPrior):

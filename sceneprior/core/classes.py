@@ -105,16 +105,13 @@ def class_colors(count: int) -> np.ndarray:
 
 
 class UnknownClassError(InputError):
-    """A requested class that the training rooms of a run do not contain.
+    """A requested or given class that a prior does not draw.
 
     Args:
-        label: The requested class.
-        known: The run's classes.
+        label: The class.
+        known: The classes that the prior draws.
     """
 
     def __init__(self, label: str, known: Sequence[str]):
-        super().__init__(
-            f"'{label}' is not a class of this run's training rooms; choose from "
-            f"{', '.join(known)}."
-        )
-        self.label = label
+        super().__init__(f"'{label}' is not a class of this prior; it draws {', '.join(known)}.")
+        self.label, self.known = label, known

@@ -7,8 +7,9 @@ lies outside its support polygon would fall over, and gets supports.
 
 import itertools
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
@@ -20,6 +21,8 @@ from sceneprior.core.shell import floor_polygon
 
 GAP_M = 2e-3
 """Distance between objects after they are pushed apart."""
+SMALLEST = 0.98
+"""Factor on the width and depth of crowded objects for which there would be no free place."""
 TOUCHING_M = 5e-4
 """Largest overlap of two bodies that is tolerated."""
 FLOOR_M = 0.3
@@ -36,16 +39,24 @@ Boxes = Float[np.ndarray, "_ 2 3"]
 """Lower and upper corners of the boxes around the bodies of objects."""
 
 
-def make_stable(scene: Scene) -> tuple[Scene, Counter[str]]:
+class Stable(NamedTuple):
+    """A scene whose objects stand and do not overlap, and what was changed for that."""
+
+    scene: Scene
+    changes: Counter[str]
+    """Numbers of objects that were `set down`, `given feet`, `moved`, `shrunk` and `left out`."""
+    left_out: list[str]
+    """A sentence for each object that was left out: room, object, reason."""
+
+
+def make_stable(scene: Scene) -> Stable:
     """Set down a scene's objects, give feet to those that would fall over, and move them apart.
 
     Objects are set down in the order of their heights, except lamps and objects that hang on walls.
     Then each object, the largest first, is moved to the nearest place where it overlaps no earlier
-    object and lies no further outside the floor than before.
-
-    Returns:
-        The scene, and the number of objects that were `set down`, `given feet`, `moved`, and `left
-        out` because there was no free place.
+    object and lies no further outside the floor than before. If an object has no such place, it
+    goes first and the larger ones are moved; then it and those that it overlaps are shrunk to
+    `SMALLEST`; and only then it is left out.
     """
     changes: Counter[str] = Counter()
     # Convex parts of meshes take seconds, so they are computed once and kept as solids.
@@ -54,7 +65,32 @@ def make_stable(scene: Scene) -> tuple[Scene, Counter[str]]:
     on_feet = [item if is_fixed(item) else add_supports(item) for item in objects]
     changes["given feet"] += sum(a is not b for a, b in zip(on_feet, objects, strict=True))
     kept = _apart(scene, on_feet, changes)
-    return replace(scene, objects=tuple(kept)), changes
+    left_out = [
+        f"{scene.name}: {name} is left out: {_reason(on_feet, row)}."
+        for row, name in enumerate(_names(on_feet))
+        if row not in kept
+    ]
+    objects = [kept[row] for row in sorted(kept)]
+    return Stable(replace(scene, objects=tuple(objects)), changes, left_out)
+
+
+def _names(objects: Sequence[SceneObject]) -> list[str]:
+    """Names of objects in messages, as those of their nodes in files."""
+    return [f"{row}_{item.label}" for row, item in enumerate(objects)]
+
+
+def _reason(objects: Sequence[SceneObject], row: int) -> str:
+    """Say which objects stand in the place of the object `row`."""
+    boxes, near = body_boxes(objects[row]), []
+    for other, name in enumerate(_names(objects)):
+        deep = 0.0
+        for low, high in body_boxes(objects[other]) if other != row else ():
+            shared = np.minimum(boxes[:, 1], high) - np.maximum(boxes[:, 0], low)
+            deep = max(deep, float(shared.min(axis=1).max()))
+        if deep > TOUCHING_M:
+            near.append(f"{name} by {100 * deep:.1f} cm")
+    there = f"it overlaps {' and '.join(near)}, and " if near else ""
+    return f"{there}no place within {REACH_M:g} m is free"
 
 
 def body_boxes(item: SceneObject) -> Boxes:
@@ -101,30 +137,73 @@ def _set_down(objects: tuple[SceneObject, ...], changes: Counter[str]) -> list[S
     return placed
 
 
-def _apart(scene: Scene, objects: list[SceneObject], changes: Counter[str]) -> list[SceneObject]:
-    """Move objects apart, the largest first; objects without a free place are left out."""
+def _apart(
+    scene: Scene, objects: Sequence[SceneObject], changes: Counter[str]
+) -> dict[int, SceneObject]:
+    """Move objects apart, and return by their rows those that have a place (see `make_stable`)."""
     floor = floor_polygon(scene)
     if floor is not None:  # without the squares into which doors swing
         doors = [o for o in scene.openings if o.kind == "door"]
         lines = [shapely.LineString([door.start_m, door.end_m]) for door in doors]
         floor -= shapely.union_all([line.buffer(line.length, cap_style="flat") for line in lines])
-    kept: dict[int, SceneObject] = {}
-    taken = np.zeros((0, 2, 3))
-    order = np.argsort([-item.size_m[0] * item.size_m[2] for item in objects], kind="stable")
-    for row in order:
-        item = objects[row]
-        boxes = body_boxes(item)
+    kept, sized, small = _in_places(objects, floor), objects, set[int]()
+    lost = [row for row in range(len(objects)) if row not in kept]
+    if lost:
+        small = {row for one in lost for row in _overlapping(objects, one)}
+        tight = [_shrunk(item) if row in small else item for row, item in enumerate(objects)]
+        for given, first in ((objects, lost), (tight, ()), (tight, lost)):
+            found = _in_places(given, floor, first)
+            if len(found) > len(kept):
+                kept, sized = found, given
+    counts = {
+        "moved": sum(item is not sized[row] for row, item in kept.items()),
+        "shrunk": len(small & kept.keys()) if sized is not objects else 0,
+        "left out": len(objects) - len(kept),
+    }
+    changes.update({change: count for change, count in counts.items() if count})
+    return kept
+
+
+def _in_places(
+    objects: Sequence[SceneObject], floor: shapely.Geometry | None, first: Sequence[int] = ()
+) -> dict[int, SceneObject]:
+    """Move each object to its nearest free place, those of `first` before the others, and the
+    larger ones before the smaller ones; objects without a free place are not returned."""
+    taken, kept = np.zeros((0, 2, 3)), dict[int, SceneObject]()
+    areas = [-item.size_m[0] * item.size_m[2] for item in objects]
+    rows = np.argsort(areas, kind="stable").tolist()
+    for row in sorted(rows, key=lambda row: row not in first):
+        item, boxes = objects[row], body_boxes(objects[row])
         offset = free_offset(boxes, taken, floor)
         if offset is None:
-            changes["left out"] += 1
             continue
         if offset.any():
-            changes["moved"] += 1
             item = item.moved((float(offset[0]), 0.0, float(offset[1])))
             boxes = boxes + np.array([offset[0], 0.0, offset[1]])
         kept[row] = item
         taken = np.concatenate([taken, boxes])
-    return [kept[row] for row in range(len(objects)) if row in kept]
+    return kept
+
+
+def _overlapping(objects: Sequence[SceneObject], row: int) -> list[int]:
+    """Rows of the objects that overlap the object `row`, which is one of them."""
+    boxes, still = body_boxes(objects[row]), np.zeros((1, 2))
+    return [
+        other
+        for other, item in enumerate(objects)
+        if _overlaps(boxes, body_boxes(item), still, -TOUCHING_M)[0]
+    ]
+
+
+def _shrunk(item: SceneObject) -> SceneObject:
+    """The object, narrower and less deep by the factor `SMALLEST` around its centre."""
+    factors = np.array([SMALLEST, 1.0, SMALLEST])
+    smaller = item.in_box(item.center_m, (factors * item.size_m).tolist())
+    turned = item.turned
+    if turned is not None:
+        width, height, depth = turned.size_m
+        turned = turned._replace(size_m=(SMALLEST * width, height, SMALLEST * depth))
+    return replace(smaller, turned=turned)
 
 
 def free_offset(

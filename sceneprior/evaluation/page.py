@@ -162,6 +162,8 @@ def write_rooms_page(
 ) -> None:
     """Write one self-contained HTML file of a few MB, with `pictures` (caption, data URI) above the
     first rooms. `shell` is that of `room_pictures`."""
+    if len(scenes) > ROOMS_SHOWN:
+        subtitle += f" · the first {ROOMS_SHOWN} of {len(scenes)} rooms"
     rooms = {"rooms": scenes[:ROOMS_SHOWN]}
     texts: dict[str, Any] = {"title": title, "subtitle": subtitle, "pictures": pictures}
     write_page(path, "rooms.html.jinja", rooms, shell=shell, **texts)

@@ -117,8 +117,11 @@ def evaluate_use(
     if not generated:
         raise InputError("There are no scenes to evaluate; give at least one.")
     names = common_label_set(generated)
+    notes = list[str]()
     if use.stand:
-        generated = [make_stable(scene)[0] for scene in generated]
+        stable = [make_stable(scene) for scene in generated]
+        generated = [each.scene for each in stable]
+        notes += [said for each in stable for said in each.left_out]
     sets: dict[str, Sequence[Scene]] = {"generated": generated}
     if shards is not None:
         train = reference_scenes(shards, "train")
@@ -148,11 +151,12 @@ def evaluate_use(
         },
     }
     if 0 < floors < len(generated):
-        note = (
+        notes.append(
             f"{len(generated) - floors} of {len(generated)} generated rooms have no floor, and are "
             "left out of the metrics that need one."
         )
-        result["note"] = " ".join(filter(None, (note, scores.get("note"))))
+    if notes:
+        result["note"] = " ".join(filter(None, (*notes, scores.get("note"))))
     return result
 
 

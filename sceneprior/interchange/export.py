@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -29,9 +29,17 @@ GROWN_M = 0.01
 """Threshold in metres: a note mentions walls that furniture pushed outwards by more."""
 
 
+class Notes(NamedTuple):
+    """Sentences for the user on an export."""
+
+    changed: Sequence[str] = ()
+    left_out: Sequence[str] = ()
+    """Those on objects that the files lack."""
+
+
 def export_scenes(
     scenes: Sequence[Scene], to: str, folder: Path, shell: ShellName | None = None
-) -> list[str]:
+) -> Notes:
     """Write rooms to a folder in one of `FORMATS`, in metres, with y up (z in `mujoco` and
     `sceneeval`).
 
@@ -39,8 +47,6 @@ def export_scenes(
         shell: The parts of the shell to write; None writes walls for simulators, and nothing in
             other formats.
 
-    Returns:
-        Notes for the user on omissions and changes.
     """
     if to not in FORMATS:
         raise InputError(f"No format '{to}'; choose from {', '.join(FORMATS)}, or scenes.")
@@ -51,12 +57,12 @@ def export_scenes(
     if to == "obj":
         for scene in scenes:
             save(scene, folder / f"{scene.name}.obj", shell=shell or "none")
-        return []
+        return Notes()
     if shell is not None:
         raise InputError(f"The format {to} has no choice of walls and floors; leave out --shell.")
     if to == "sceneeval":
         write_sceneeval(scenes, folder)
-        return []
+        return Notes()
     named = [
         replace(scene, objects=tuple(o for o in scene.objects if o.label != "void"))
         for scene in scenes
@@ -64,16 +70,17 @@ def export_scenes(
     CLASS_FORMATS[to](named, folder)
     left_out = sum(len(a.objects) - len(b.objects) for a, b in zip(scenes, named, strict=True))
     if left_out:
-        return [f"Objects of class void are left out ({left_out}): {to} has no such class."]
-    return []
+        said = f"Objects of class void are left out ({left_out}): {to} has no such class."
+        return Notes(left_out=[said])
+    return Notes()
 
 
-def _export_standing(scenes: Sequence[Scene], to: str, folder: Path, shell: ShellName) -> list[str]:
-    """Make objects stable and write the rooms; return notes on what changed."""
-    pairs = [make_stable(scene) for scene in scenes]
-    standing, notes = [scene for scene, _ in pairs], []
+def _export_standing(scenes: Sequence[Scene], to: str, folder: Path, shell: ShellName) -> Notes:
+    """Make objects stable and write the rooms."""
+    found = [make_stable(scene) for scene in scenes]
+    standing, notes = [each.scene for each in found], list[str]()
     SIMULATORS[to](standing, folder, shell)
-    changes = sum((counts for _, counts in pairs), Counter[str]())
+    changes = sum((each.changes for each in found), Counter[str]())
     if listed := ", ".join(f"{count} {change}" for change, count in changes.items() if count):
         total = sum(len(scene.objects) for scene in scenes)
         notes.append(
@@ -85,7 +92,7 @@ def _export_standing(scenes: Sequence[Scene], to: str, folder: Path, shell: Shel
             f"Walls of {rooms} rooms stand further out than floor_m, by up to {max(grown_m):.2f} "
             "m, because furniture stands there."
         )
-    return notes
+    return Notes(notes, [said for each in found for said in each.left_out])
 
 
 def _write_mujoco(scenes: Sequence[Scene], folder: Path, shell: ShellName) -> None:

@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from sceneprior.core.boxes import CUBE_CORNERS, yaw_rotation
 from sceneprior.core.errors import InputError, InputWarning
 from sceneprior.core.files import is_name, list_files, read_json, write_json, write_whole
-from sceneprior.core.scene import Mesh, Scene, Textured
+from sceneprior.core.scene import Mesh, Scene, SceneObject, Textured
 from sceneprior.core.scene_json import FORMAT, read_scene, scene_to_json
 from sceneprior.core.shell import ShellName, is_shell, shell_meshes
 from sceneprior.render.appearance import (
@@ -30,6 +31,8 @@ from sceneprior.render.model_files import joined, load_parts
 from sceneprior.render.scene_simulators import scene_to_usd
 
 NO_SHELL: Mapping[str, Mesh] = {}
+ROUNDED_M = 1e-4
+"""Distance by which the corners of a box differ between a GLB and a JSON, which round."""
 PACKAGE_FORMATS = "sceneprior-"
 """Prefix of the names of the package's formats."""
 
@@ -218,15 +221,26 @@ def load_scene(path: Path, with_materials: bool = False) -> Scene:
             f"{glb.name} and {path.name} describe different objects (only in one of them: "
             f"{', '.join(unlisted[:4])}); write both again with `sceneprior synthesize`."
         )
-    with_mesh = [
-        replace(
-            item,
-            mesh=parts[node][0].mesh if len(parts[node]) == 1 else joined(parts[node]),
-            textured=tuple(each for each in parts[node] if each.material is not None),
-        )
-        for node, item in zip(wanted, scene.objects, strict=True)
-    ]
-    return replace(scene, objects=tuple(with_mesh))
+    pairs = zip(scene.objects, (parts[node] for node in wanted), strict=True)
+    return replace(scene, objects=tuple(_with_mesh(item, found) for item, found in pairs))
+
+
+def _with_mesh(item: SceneObject, parts: Sequence[Textured]) -> SceneObject:
+    """The object with the parts of its mesh. If the mesh is only its box, which files have in place
+    of no mesh, the object stays without one; if it is the turned box, that is its solid, too."""
+    mesh = parts[0].mesh if len(parts) == 1 else joined(parts)
+    textured = tuple(part for part in parts if part.material is not None)
+    if textured or len(mesh.vertices_m) != len(CUBE_CORNERS):
+        return replace(item, mesh=mesh, textured=textured)
+
+    def fits(size_m: Sequence[float], yaw_rad: float) -> bool:
+        own_m = CUBE_CORNERS / 2 * size_m @ yaw_rotation(yaw_rad).T + item.center_m
+        return np.allclose(mesh.vertices_m, own_m, rtol=0, atol=ROUNDED_M)
+
+    if fits(item.size_m, 0.0):
+        return item
+    is_turned = item.turned is not None and fits(item.turned.size_m, item.turned.yaw_rad)
+    return replace(item, mesh=mesh, solids=item.solids or (mesh,) * is_turned)
 
 
 def load_scene_folder(folder: Path, with_materials: bool = False) -> list[Scene]:
@@ -239,6 +253,8 @@ def load_scene_folder(folder: Path, with_materials: bool = False) -> list[Scene]
     folder = Path(folder)
     if not folder.is_dir():
         _refuse_box_lists(folder, [folder])
+        if folder.is_file():
+            raise InputError(f"{folder} is a file; give the folder of scenes, {folder.parent}.")
         raise InputError(f"No folder of scenes at {folder}; `sceneprior synthesize` writes one.")
     # Zero-padded numbers sort like numbers.
     paths = sorted(

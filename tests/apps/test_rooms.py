@@ -5,8 +5,9 @@ from dataclasses import replace
 import pytest
 from PIL import Image
 
-from sceneprior.apps.rooms import write_scene, write_scenes
+from sceneprior.apps.rooms import overview, write_scene, write_scenes
 from sceneprior.core.scene import Scene, SceneObject
+from sceneprior.render.appearance import CAPTION_PX
 
 
 @pytest.fixture
@@ -27,6 +28,13 @@ def test_new_scenes_leave_none_of_the_old_ones_behind_and_everything_else_alone(
     assert {path.name for path in tmp_path.iterdir()} == {
         "b.json", "b.glb", "b.png", "overview.png", "scores.json", "notes.txt", "film.part",
     }  # fmt: skip
+
+
+def test_an_overview_says_how_many_rooms_it_lacks(scene, monkeypatch):
+    monkeypatch.setattr("sceneprior.apps.rooms.OVERVIEW_ROOMS", 4)
+    four, five = overview([scene] * 4), overview([scene] * 5)
+    assert five.shape == (four.shape[0] + CAPTION_PX, *four.shape[1:])
+    assert five[:CAPTION_PX].min() == 0 and (five[CAPTION_PX:] == four).all()
 
 
 def test_a_failed_write_leaves_nothing_under_the_final_name(scene, tmp_path, monkeypatch):

@@ -15,8 +15,38 @@ KINDS = ("box", "cylinder", "ellipsoid", "dome", "bowl")
 
 
 def standing(*objects, floor=None) -> tuple[Scene, dict[str, int]]:
-    scene, told = make_stable(Scene("room", "front3d_bedroom", objects, floor))
+    scene, told, _ = make_stable(Scene("room", "front3d_bedroom", objects, floor))
     return scene, {key: value for key, value in told.items() if value}
+
+
+@pytest.mark.parametrize(
+    "length_m, expected",
+    [
+        (2.65, {"moved": 1}),  # the bed, since the wardrobe stands at a wall
+        (2.58, {"shrunk": 2}),
+        (2.54, {"left out": 1}),
+    ],
+)
+def test_an_object_without_a_place_moves_others_then_shrinks_then_is_named(length_m, expected):
+    """A bed that reaches into a wardrobe, between two walls: both need 2.6 m."""
+    near = min(0.585, length_m - 2.0)
+    bed = solid_box("double_bed", (0.0, 0.3, near + 1.0), (1.8, 0.6, 2.0))
+    wardrobe = solid_box("wardrobe", (0.0, 1.0, 0.3), (1.8, 2.0, 0.6))
+    floor = np.array([[-0.9, 0], [0.9, 0], [0.9, length_m], [-0.9, length_m]])
+    given = Scene("room", "front3d_bedroom", (bed, wardrobe), floor)
+    scene, changes, left_out = make_stable(given)
+    assert {key: value for key, value in changes.items() if value} == expected
+    if "left out" in expected:
+        assert left_out == [
+            "room: 1_wardrobe is left out: it overlaps 0_double_bed by 6.0 cm, and no place within "
+            "2 m is free."
+        ]
+        return
+    assert left_out == []
+    assert (scene.sizes_m >= 0.98 * given.sizes_m - 1e-9).all()
+    bed, wardrobe = scene.objects
+    gap = bed.center_m[2] - bed.size_m[2] / 2 - wardrobe.center_m[2] - wardrobe.size_m[2] / 2
+    assert gap > 0
 
 
 def test_a_table_on_one_side_gets_feet_and_keeps_its_solids():

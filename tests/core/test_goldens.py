@@ -95,7 +95,7 @@ def found(folder: Path) -> dict[str, object]:
         told[f"{scene.name} inside"] = {
             key: summary(mesh.vertices_m) for key, mesh in shell_of(scene).inner_meshes().items()
         }
-        stable, changes = make_stable(scene)
+        stable, changes, _ = make_stable(scene)
         told[f"{scene.name} stable"] = [stable.centers_m.round(4).tolist(), dict(changes)]
     room = shell_room(L_SHAPE, [(-1.0, 0.5), (-1.2, -0.8)])
     walls, doors = find_walls(room)

@@ -166,9 +166,7 @@ def _score(
 def eval_svr(
     shards: Annotated[Path, option("Shards with 3D ground truth.")],
     run: Annotated[str | None, option("Run to evaluate.")] = None,
-    scenes: Annotated[
-        Path | None, option("Scenes of `reconstruct` or `retrieve`, in place of --run.")
-    ] = None,
+    scenes: options.Scenes = None,
     split: Annotated[str, option("Split: train, val or test.")] = "test",
     views: Annotated[int, option("Largest number of views per room.", min=1)] = 1,
     limit: options.Limit = None,

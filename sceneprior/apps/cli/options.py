@@ -49,7 +49,21 @@ Inception = Annotated[
     Path | None, option("The file inception-2015-12-05.pt (TorchScript), for FID.")
 ]
 Accelerator = Annotated[str, option("Device to train on: cpu, gpu or auto (Lightning).")]
-Scenes = Annotated[Path | None, option("A folder of scene JSONs of any method, in place of --run.")]
+
+
+def _is_folder(scenes: Path | None) -> Path | None:
+    if scenes is not None and scenes.is_file():
+        raise InputError(
+            f"--scenes {scenes} is a file, but a folder of scenes is needed; give {scenes.parent}, "
+            "or copy the file to a folder of its own."
+        )
+    return scenes
+
+
+Scenes = Annotated[
+    Path | None,
+    option("A folder of scene JSONs of any method, in place of --run.", callback=_is_folder),
+]
 Fit = Annotated[str, option("Fit: objects (one by one), or paper (one latent, in 1,000 steps).")]
 Limit = Annotated[int | None, option("Number of rooms (default: all).", min=1)]
 Restarts = Annotated[int, option("Latents to fit to each image; the best is kept.", min=1)]

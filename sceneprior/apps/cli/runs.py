@@ -4,7 +4,7 @@ Each imports its dependencies when it is called.
 """
 
 import pkgutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
@@ -15,6 +15,9 @@ from sceneprior.apps.cli import options
 from sceneprior.apps.cli.options import option
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import check_free
+
+LEFT_OUT = 3
+"""Exit status of a strict export that lacks an object."""
 
 
 def fit(
@@ -213,12 +216,15 @@ def export(
         str | None, option("Extents in box lists: half, as ATISS writes them (default), or full.")
     ] = None,
     shell: options.Shell = None,
+    strict: Annotated[
+        bool, option("Exit with status 3 if an object is left out.", "--strict")
+    ] = False,
     overwrite: options.Overwrite = False,
 ) -> None:
     """Export scenes to another format, or convert box lists, such as ATISS's, to scenes.
 
     For simulators, walls are added unless --shell says otherwise, and objects are moved until they
-    stand and do not overlap.
+    stand and do not overlap. Objects that the format or the room has no place for are named.
     """
     from sceneprior.apps.rooms import write_scenes
     from sceneprior.interchange.box_lists import read_box_lists
@@ -226,6 +232,7 @@ def export(
     from sceneprior.render.scene_files import load_scene_folder
 
     check_free(out, overwrite)
+    left_out: Sequence[str] = ()
     if to == "scenes":
         if label_set is None:
             raise InputError("--to scenes needs --label-set, the label set of the box lists.")
@@ -236,6 +243,10 @@ def export(
             raise InputError("--label-set, --classes and --sizes apply only with --to scenes.")
         rooms = load_scene_folder(source, with_materials=True)
         asked = None if shell is None else options.checked_shell(shell)
-        for note in export_scenes(rooms, to, out, asked):
+        notes = export_scenes(rooms, to, out, asked)
+        left_out = notes.left_out
+        for note in (*notes.changed, *left_out):
             typer.echo(f"Note: {note}", err=True)
     typer.echo(f"Wrote {options.rooms_in_words(len(rooms))} to {out}")
+    if strict and left_out:
+        raise typer.Exit(LEFT_OUT)

@@ -122,7 +122,7 @@ def download(scene: Scene, form: str, shell: ShellName) -> tuple[str, bytes, lis
             save(scene, folder / f"{scene.name}{to}", shell=shell)
         else:
             chosen = shell if to in (*SIMULATORS, "obj") else None
-            notes = export_scenes([scene], to, folder, chosen)
+            notes = [note for kind in export_scenes([scene], to, folder, chosen) for note in kind]
         files = sorted(path for path in folder.rglob("*") if path.is_file())
         if len(files) == 1 and files[0].parent == folder:
             return files[0].name, files[0].read_bytes(), notes

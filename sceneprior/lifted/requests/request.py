@@ -8,6 +8,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationError, model_validator
 
 from sceneprior.core.checked import fault_of, shown
+from sceneprior.core.classes import UnknownClassError
 from sceneprior.core.classes import label_set as label_set_of
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Opening, SceneObject
@@ -207,10 +208,7 @@ class RoomRequest(BaseModel):
         classes = tuple(label_set_of(label_set))
         for item in self.objects:
             if item.label not in classes[1:]:
-                raise InputError(
-                    f"A given object is a '{item.label}', which this run does not know; its "
-                    f"classes are {', '.join(classes[1:])}."
-                )
+                raise UnknownClassError(item.label, known)
         floor = None if outline_m is None else Floor(outline_m)
         found = Conditions(classes, floor, openings, self.ceiling_m, wishes, self.objects)
         check_request(found, known, most, may_meet)

@@ -171,3 +171,12 @@ def test_export_goes_both_ways(command, tmp_path):
     back = ["export", "atiss", "--to", "scenes", "--out", "back", "--label-set", BEDROOM]
     assert command(*back)[0] == 0
     assert {path.stem for path in (tmp_path / "back").glob("*.json")} == {"first", "second"}
+
+
+def test_a_strict_export_without_an_object_has_status_3(command, tmp_path):
+    void = SceneObject("void", (0.2, 0.3, -0.9), (1.7, 0.6, 2.1))
+    write_scenes([Scene("room", BEDROOM, (void,))], tmp_path / "rooms")
+    call = ["export", "rooms", "--to", "atiss", "--out", "out", "--overwrite"]
+    note = "Note: Objects of class void are left out (1): atiss has no such class.\n"
+    assert command(*call)[::2] == (0, note)
+    assert command(*call, "--strict")[::2] == (3, note)
