@@ -186,6 +186,12 @@ def squares_beside(bed: Piece, size_m: float) -> dict[tuple[float, float], shape
     return found
 
 
+def floor_beside(bed: Piece, side: float, depth_m: float) -> shapely.Polygon:
+    """The strip of floor along a long side of a bed."""
+    _, across, long_m, wide_m = _axes_of(bed)
+    return _rectangle(bed.center + across * side * wide_m / 2, across * side, long_m, depth_m)
+
+
 def pairs_at_bed(pieces: Sequence[Piece]) -> list[Finding]:
     """Outcome for the only bed and its two nightstands: they flank one of its ends."""
     beds, stands = rows_of(pieces, BEDS), rows_of(pieces, NIGHTSTANDS)

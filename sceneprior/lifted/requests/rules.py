@@ -12,8 +12,10 @@ from jaxtyping import Bool, Float, Int
 from sceneprior.core.arrangements import (
     BEDS,
     NIGHTSTANDS,
+    OPENED,
     end_of_bed,
     findings,
+    floor_beside,
     heads,
     rows_of,
 )
@@ -152,6 +154,11 @@ class PlacementRules:
             for each in found.get(check, [])
             if not each.holds
         }
+        used_from = {
+            ("path to the front", (row,)): pieces[row].before(PATH_M)
+            for row in rows_of(pieces, OPENED)
+            if pieces[row].front is not None and pieces[row].standing
+        }
         beds = rows_of(pieces, BEDS)
         if len(beds) == 1:
             bed = pieces[beds[0]]
@@ -159,6 +166,14 @@ class PlacementRules:
                 place = end_of_bed(bed, pieces[row])
                 if place is None or place[0] not in heads(bed):
                     failed.add(("beside the head", (row,)))
+                else:
+                    strip = floor_beside(bed, place[1], PATH_M)
+                    used_from["path to the bedside", (row,)] = strip
+        if self._paths is not None and used_from:
+            walked = self._paths.walked(furniture.boxes_m)
+            failed |= {
+                key for key, strip in used_from.items() if not self._paths.meet(strip, walked)
+            }
         return failed
 
     def _all_reached(self, furniture: Furniture) -> bool:
@@ -238,22 +253,39 @@ class Paths:
         bottoms = boxes_m[:, 1] - boxes_m[:, 4] / 2
         needed = needs_access & (bottoms <= FLOOR_M) & (boxes_m[:, 4] > FLAT_M)
         found = np.ones(len(boxes_m), dtype=bool)
-        if not self.starts or not needed.any():
-            return found
+        if self.starts and needed.any():
+            walked = self.walked(boxes_m)
+            for row in np.flatnonzero(needed):
+                around = self._cells(boxes_m[row], PATH_M / 2 + ARM_M)
+                found[row] = walked[:, *around].any(axis=(1, 2)).all()
+        return found
+
+    def walked(self, boxes_m: Float[np.ndarray, "objects 6"]) -> Bool[np.ndarray, "doors x z"]:
+        """The points to which paths lead from each door, with all boxes as obstacles."""
         from scipy import ndimage
 
         free = self.floor.copy()
-        obstacles = (bottoms < HEAD_M) & (boxes_m[:, 4] > FLAT_M)
-        for row in np.flatnonzero(obstacles):
+        bottoms = boxes_m[:, 1] - boxes_m[:, 4] / 2
+        for row in np.flatnonzero((bottoms < HEAD_M) & (boxes_m[:, 4] > FLAT_M)):
             free[self._cells(boxes_m[row], PATH_M / 2 - CELL_M / 2)] = False
         areas, _ = ndimage.label(free)
+        found = []
         for x, z in self.starts:
             area = areas[max(x - 2, 0) : x + 3, max(z - 2, 0) : z + 3]
-            own = np.unique(area[area > 0])
-            walked = np.isin(areas, own)
-            for row in np.flatnonzero(needed & found):
-                found[row] = walked[self._cells(boxes_m[row], PATH_M / 2 + ARM_M)].any()
-        return found
+            found.append(np.isin(areas, np.unique(area[area > 0])))
+        return np.array(found)
+
+    def meet(self, strip: shapely.Polygon, walked: Bool[np.ndarray, "doors x z"]) -> bool:
+        """True if paths lead from every door to a strip of floor along the axes."""
+        low_x, low_z, high_x, high_z = strip.bounds
+        x, z, width, depth = (
+            (low_x + high_x) / 2,
+            (low_z + high_z) / 2,
+            high_x - low_x,
+            high_z - low_z,
+        )
+        cells = self._cells(np.array([x, 0.0, z, width, 0.0, depth]), 0.0)
+        return bool(walked[:, *cells].any(axis=(1, 2)).all())
 
     def _cells(self, box_m: Float[np.ndarray, "6"], margin_m: float) -> tuple[slice, slice]:
         """The cells of a footprint, with a margin around it."""

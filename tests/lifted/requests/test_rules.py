@@ -111,3 +111,21 @@ def test_new_objects_leave_the_path_to_a_given_one_if_it_has_one(barred):
 def furniture(boxes: list[list[float]]) -> Furniture:
     count = len(boxes)
     return Furniture(np.array(boxes), np.zeros(count, int), np.full(count, 1), np.zeros((count, 2)))
+
+
+@pytest.mark.parametrize(("wardrobe", "front", "closed"), [
+    ([1.75, 1.0, -0.2, 0.5, 2.0, 1.6], (-1, 0), set()),
+    ([1.1, 1.0, -1.2, 1.8, 2.0, 0.6], (0, 1), {3}),  # bars the way past the bed's foot
+])  # fmt: skip
+def test_a_wardrobe_leaves_paths_to_its_front_and_to_both_sides_of_a_bed(wardrobe, front, closed):
+    """The door is in the wall at the bed's foot; nightstands are rows 2 and 3."""
+    classes = ["wardrobe", "double_bed", "nightstand"]
+    boxes = [wardrobe, [0, 0.4, 0.49, 1.6, 0.8, 2.0]]
+    boxes += [[side * 1.05, 0.25, 1.25, 0.45, 0.5, 0.45] for side in (-1, 1)]
+    fronts = np.array([front, (0, -1), (0, -1), (0, -1)], float)
+    room = Furniture(np.array(boxes), np.array([0, 1, 2, 2]), np.full(4, -1), fronts)
+    door = Opening("door", (-1.9, -1.5), (-1.0, -1.5), 0.0, 2.0)
+    shape = RoomShape(Floor(read_floor("4x3")), (door,))
+    failed = PlacementRules(shape, [], classes, room.rows([])).faults(room)
+    assert {row for key, (row, *_) in failed if key == "path to the bedside"} == closed
+    assert (("path to the front", (0,)) in failed) == bool(closed)
