@@ -16,6 +16,7 @@ from data_prep.front.recipe import load_recipe
 from data_prep.front.source import FrontSource
 from data_prep.homes.make import make_homes
 from sceneprior.apps.config import load_config
+from sceneprior.core.parallel import on_workers
 from sceneprior.core.settings import find_config
 from sceneprior.training.fit import fit
 from sceneprior.training.method import RunConfig
@@ -33,7 +34,8 @@ def made_shards(folder: Path, rooms: int, workers: int) -> Path:
         front, future = homes / "3D-FRONT", homes / "3D-FUTURE-model"
         splits = homes / "splits" / "bedroom.csv"
         source = FrontSource(front, future, load_recipe("bedroom"), splits)
-        build_shards(Job(source, shards, workers, renderer="software"))
+        with on_workers(workers):
+            build_shards(Job(source, shards, renderer="software"))
     return shards
 
 

@@ -3,6 +3,7 @@
 Heavy imports are inside the functions, so that the command line starts quickly.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,10 +15,12 @@ if TYPE_CHECKING:
     from data_prep.engine.source import Source
 
 
-def add_commands(app: typer.Typer) -> None:
-    """Mount the prep-* commands, inspect and make-homes."""
-    prep = (prep_front, recipe, prep_scannet, prep_posed, prep_dataset)
-    for command in (make_homes, *prep, inspect):
+def add_commands(app: typer.Typer, with_workers: Callable[..., Any]) -> None:
+    """Mount the prep-* commands, inspect and make-homes; `with_workers` adds the options that
+    choose where work runs."""
+    prep = (prep_front, prep_scannet, prep_posed, prep_dataset)
+    parallel = (*(with_workers(command, usual=None) for command in prep), with_workers(inspect))
+    for command in (make_homes, recipe, *parallel):
         app.command()(command)
 
 
@@ -25,9 +28,6 @@ _SHEET = "inspect.png"
 _PROBLEMS_SHOWN = 10
 
 Out = Annotated[Path, typer.Option(help="Folder for the shards.")]
-Workers = Annotated[
-    int | None, typer.Option(min=1, help="Processes on this machine (default: all cores).")
-]
 Seed = Annotated[
     int, typer.Option(min=0, max=LARGEST_SEED, help="The same seed writes the same bytes.")
 ]
@@ -78,7 +78,6 @@ def prep_front(
         typer.Option(help="Change a rule of the recipe: max_floor_m=8; null turns it off."),
     ] = None,
     seed: Seed = 0,
-    workers: Workers = None,
     renderer: Annotated[str, typer.Option(help="auto, pyrender or software.")] = "auto",
     only: Annotated[
         str | None, typer.Option(help="One house or room only: HOUSE, HOUSE/ROOM or a room id.")
@@ -95,7 +94,7 @@ def prep_front(
     density = () if views_per_m2 is None else (f"views.per_m2={views_per_m2}",)
     rules = load_recipe(recipe, (*(rule or ()), *density))
     source = FrontSource(front, future, rules, splits, seed, only)
-    run_job(source, out, workers, retry_failed=retry_failed, renderer=renderer)
+    run_job(source, out, retry_failed=retry_failed, renderer=renderer)
 
 
 def recipe(
@@ -127,7 +126,6 @@ def prep_scannet(
         typer.Option(help="List of test scans, scannetv2_val.txt (default: a random 9:1 split)."),
     ] = None,
     seed: Seed = 0,
-    workers: Workers = None,
     only: Annotated[str | None, typer.Option(help="A scan, or a prefix of scans' names.")] = None,
     retry_failed: Retry = False,
 ) -> None:
@@ -142,7 +140,7 @@ def prep_scannet(
         image_size=FULL_SIZE if full_size else QUARTER_SIZE, train=train_list, val=val_list,
         seed=seed, only=only,
     )  # fmt: skip
-    run_job(source, out, workers, retry_failed=retry_failed)
+    run_job(source, out, retry_failed=retry_failed)
 
 
 def prep_posed(
@@ -199,7 +197,6 @@ def prep_posed(
     max_views: MaxViews = 100,
     test_share: Annotated[float, typer.Option(help="Share of rooms in the test split.")] = 0.1,
     seed: Seed = 0,
-    workers: Workers = None,
     only: Annotated[str | None, typer.Option(help="A room, or a prefix of rooms' names.")] = None,
 ) -> None:
     """Turn posed pictures with instance masks into view shards (docs/posed_data.md).
@@ -221,7 +218,7 @@ def prep_posed(
         typer.echo(f"Found {sentence}", err=True)
     for sentence in source.assumptions():
         typer.echo(f"Note: {sentence}", err=True)
-    run_job(source, out, workers, verified=True)
+    run_job(source, out, verified=True)
 
 
 def prep_dataset(
@@ -245,7 +242,6 @@ def prep_dataset(
     max_side: Annotated[int, typer.Option(help="Longest side of stored masks in pixels.")] = 480,
     max_views: MaxViews = 100,
     seed: Seed = 0,
-    workers: Workers = None,
     only: Annotated[
         str | None, typer.Option(help="One scene or room only: SCENE, SCENE/ROOM or a room id.")
     ] = None,
@@ -261,7 +257,7 @@ def prep_dataset(
         name, folder, recipe, splits=splits, max_side=max_side, max_views=max_views, seed=seed,
         only=only,
     )  # fmt: skip
-    run_job(source, out, workers, retry_failed=retry_failed)
+    run_job(source, out, retry_failed=retry_failed)
 
 
 def inspect(
@@ -274,7 +270,6 @@ def inspect(
     verify: Annotated[
         bool, typer.Option("--verify", help="Check everything instead of drawing.")
     ] = False,
-    workers: Annotated[int, typer.Option(min=1, help="Processes for --verify.")] = 1,
 ) -> None:
     """Print what a folder of shards holds and draw some views, or check it with --verify.
 
@@ -288,7 +283,7 @@ def inspect(
     from sceneprior.render.appearance import png_bytes
 
     if verify:
-        _verify(shards, room, workers)
+        _verify(shards, room)
     else:
         for table in count_tables(shards) if room is None else [room_table(shards, room)]:
             Console().print(table)
@@ -299,13 +294,13 @@ def inspect(
         typer.echo(f"Drew {target}.")
 
 
-def _verify(shards: Path, room: str | None, workers: int) -> None:
+def _verify(shards: Path, room: str | None) -> None:
     from rich.console import Console
 
     from data_prep.inspection.tables import check_tables, summary
     from data_prep.inspection.verify import verify
 
-    found = verify(shards, room, workers)
+    found = verify(shards, room)
     for table in check_tables(found):
         Console().print(table)
     for sentence in found.problems[1:_PROBLEMS_SHOWN]:
@@ -318,9 +313,7 @@ def _verify(shards: Path, room: str | None, workers: int) -> None:
     typer.echo(f"{shards}: {summary(found)}")
 
 
-def run_job(
-    source: "Source", out: Path, workers: int | None, verified: bool = False, **options: Any
-) -> None:
+def run_job(source: "Source", out: Path, verified: bool = False, **options: Any) -> None:
     """Build shards and print the report, for every `prep-*` command; `options` are those of
     `Job`. If `verified`, the verdict of `inspect --verify` follows."""
     from rich.console import Console
@@ -329,7 +322,7 @@ def run_job(
     from data_prep.engine.report import report_tables
 
     try:
-        summary = build_shards(Job(source, out, workers, **options))
+        summary = build_shards(Job(source, out, **options))
     except KeyboardInterrupt:
         typer.echo("Stopped; finished shards are kept. Run the same command to continue.", err=True)
         raise typer.Exit(130) from None
@@ -344,7 +337,7 @@ def run_job(
         from data_prep.inspection.tables import verdict
         from data_prep.inspection.verify import verify
 
-        typer.echo(f"Note: {verdict(verify(out, workers=workers or 1))}", err=True)
+        typer.echo(f"Note: {verdict(verify(out))}", err=True)
     if source.only is None and not summary.counts["test"]["rooms"]:
         typer.echo(
             "Note: the 'test' split is empty. `fit` and `synthesize` do not need it, but eval-fid "

@@ -215,14 +215,12 @@ CAPTURES = {
 def capture(name: str, file: str, folder: Path) -> Entry:
     from toy_formats import FORMATS as SOURCES
 
-    from data_prep.engine.source import pool
     from data_prep.readers.posed.reader import Posed
 
     source = SOURCES[name](folder).source
     posed = isinstance(source, Posed)
     path = sorted((folder / ("attic" if posed else "")).glob(file))[0]
-    with pool(1) as run:
-        (task,) = source.survey(run).rooms
+    (task,) = source.survey().rooms
 
     def read() -> None:
         if posed:

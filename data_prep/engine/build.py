@@ -1,14 +1,13 @@
 """Builds a folder of shards from a source, in parallel and resumable.
 
-Every `prep-*` command runs this engine. It prepares the source's rooms shard by shard in worker
-processes (source.py), and writes a report at the end. `plan.json` is written first, and of each
+Every `prep-*` command runs this engine. It prepares the source's rooms shard by shard, as tasks
+(core/parallel.py), and writes a report at the end. `plan.json` is written first, and of each
 shard its models, its report and, last, the shard itself; files are whole or absent, so that a run
 may be killed anywhere and resumed by the same command.
 """
 
 import contextlib
 import errno
-import os
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -33,7 +32,7 @@ from data_prep.engine.report import (
     line_of,
     report_csv,
 )
-from data_prep.engine.source import Line, PreparedRoom, Run, Source, pool, sentence_of
+from data_prep.engine.source import Line, PreparedRoom, Source, sentence_of
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import (
     json_text,
@@ -44,6 +43,7 @@ from sceneprior.core.files import (
     write_whole,
 )
 from sceneprior.core.observations import RoomGroundTruth, RoomViews
+from sceneprior.core.parallel import check_shared, run_tasks
 from sceneprior.core.scene import Mesh
 from sceneprior.core.shard_writing import check_views, shard_bytes
 from sceneprior.core.shards import INDEX_NAME, MODELS_FOLDER
@@ -58,8 +58,6 @@ class Job:
 
     source: Source
     out: Path
-    workers: int | None = 1
-    """Number of processes on this machine; 1 works in this process, None takes all cores."""
     renderer: str = "auto"
     retry_failed: bool = False
 
@@ -68,24 +66,23 @@ def build_shards(job: Job) -> Summary:
     """Prepare a data set. A second run with the same settings makes only the missing shards."""
     source, out = job.source, Path(job.out)
     settings = job_settings(source, source.only)  # rejects wrong input folders before `out` exists
-    cores = len(os.sched_getaffinity(0))
-    with claimed(out), pool(job.workers or cores) as run:
+    with claimed(out):
         plan = read_plan(out, source, settings, job.renderer)
         if plan is None:
-            kinds = run(_renderer_kind, [(job.renderer,)], None) if source.draws else iter([None])
-            settings["renderer"] = next(kinds)
-            survey = source.survey(run)
+            tasks = {"opening a renderer": (job.renderer,)} if source.draws else {}
+            settings["renderer"], *_ = [*run_tasks(_renderer_kind, tasks), None]
+            survey = source.survey()
             plan = JobPlan(settings, survey.rooms, survey.left_out)
             with writing(out):
                 write_json(out / PLAN_NAME, asdict(plan))
-        return _carry_out(replace(job, out=out), plan, run)
+        return _carry_out(replace(job, out=out), plan)
 
 
 def _renderer_kind(kind: str) -> str:
     return open_renderer(kind).kind
 
 
-def _carry_out(job: Job, plan: JobPlan, run: Run) -> Summary:
+def _carry_out(job: Job, plan: JobPlan) -> Summary:
     source, out = job.source, job.out
     shards = plan.shards(source.room_type)
     reports: dict[str, ShardReport] = {}
@@ -101,10 +98,9 @@ def _carry_out(job: Job, plan: JobPlan, run: Run) -> Summary:
             for name in REPORT_FILES:
                 (out / name).unlink(missing_ok=True)
     kind = plan.settings["renderer"]
-    arguments = [(source, out, kind, shard) for shard in missing]
-    made = run(make_shard, arguments, "preparing") if missing else iter(())
-    for shard, report in zip(missing, made, strict=True):
-        reports[shard.name] = report
+    tasks = {_rooms_of(shard): (source, out, kind, shard) for shard in missing}
+    made = run_tasks(make_shard, tasks, "preparing")
+    reports |= zip((shard.name for shard in missing), made, strict=True)
     done = [reports[shard.name] for shard in shards if shard.name in reports]
     lines = [*plan.left_out, *(line for report in done for line in report.lines)]
     drawn = done[-1].renderer if done else kind
@@ -141,6 +137,10 @@ def _asked_for(source: Source, plan: JobPlan, shards: list[ShardTask]) -> list[S
     return chosen
 
 
+def _rooms_of(shard: ShardTask) -> str:
+    return f"rooms {shard.rooms[0].room_id} to {shard.rooms[-1].room_id}"
+
+
 @dataclass(frozen=True)
 class ShardReport:
     """Outcome of a shard's rooms, as stored in `<shard>.report.json`."""
@@ -162,9 +162,9 @@ def make_shard(
     Models are written first, then the report, then the shard, so that a shard with a report is
     complete (`read_finished`).
     """
+    check_shared(out / PLAN_NAME)
     path = out / shard.name
-    first, last = shard.rooms[0].room_id, shard.rooms[-1].room_id
-    with writing(out, f"rooms {first} to {last}"):
+    with writing(out, _rooms_of(shard)):
         # The report is deleted first, so that the shard counts as unfinished if the job stops here.
         _report_path(path).unlink(missing_ok=True)
         path.unlink(missing_ok=True)

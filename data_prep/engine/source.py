@@ -1,29 +1,18 @@
-"""The interface between a data set (`Source`) and the engine, and the processes it works in.
+"""The interface between a data set (`Source`) and the engine.
 
 A source reads the files of a data set and knows no shards or reports; the engine (build.py) handles
 those and knows no data set. `front/source.py` is the source for 3D-FRONT.
 """
 
-import contextlib
-import multiprocessing
 import os
-import signal
-import threading
-import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from multiprocessing.connection import wait
 from typing import Any, Protocol
 
 from sceneprior.core.errors import InputError
 from sceneprior.core.observations import RoomGroundTruth, RoomViews
 from sceneprior.core.scene import Mesh
 from sceneprior.render.offscreen import Renderer
-
-Run = Callable[..., Iterator[Any]]
-"""`run(function, argument_lists, title)` yields results in order (`pool`)."""
 
 
 @dataclass(frozen=True)
@@ -134,11 +123,10 @@ class Source(Protocol):
         the value of `--only` to assume: the source's own, or None for everything.
         """
 
-    def survey(self, run: Run) -> Survey:
-        """Make one cheap pass over the data set and list the rooms to prepare.
+    def survey(self) -> Survey:
+        """Make one cheap pass over the data set (`run_tasks`) and list the rooms to prepare.
 
-        `run(function, argument_lists, title)` does the work in worker processes and yields the
-        results in order. Raises InputError if no room is left, or `train` is empty.
+        Raises InputError if no room is left, or `train` is empty.
         """
 
     def prepare(self, task: RoomTask, renderer: Renderer | None) -> PreparedRoom | Line:
@@ -158,76 +146,3 @@ def sentence_of(error: Exception) -> str:
     if os.environ.get("SCENEPRIOR_DEBUG"):
         raise error
     return " ".join(f"unforeseen {type(error).__name__}: {error}".split())[:300]
-
-
-@contextlib.contextmanager
-def pool(workers: int) -> Iterator[Run]:
-    """Open a process pool as `run(function, argument_lists, title)`, which yields results in order.
-
-    A single worker is this process itself. A progress bar goes to stderr if there is a title.
-    """
-    if workers <= 1:
-        yield _in_process
-        return
-    # Processes are spawned, never forked, because a GL context does not survive a fork.
-    context = multiprocessing.get_context("spawn")
-    executor = ProcessPoolExecutor(workers, context, initializer=_start_worker)
-
-    def submit(function: Callable[..., Any], *item: Any) -> Any:
-        # Only this process handles Ctrl-C; workers inherit the blocked signal.
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
-            return executor.submit(function, *item)
-        finally:
-            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-
-    def in_order(
-        function: Callable[..., Any], arguments: list[Any], title: str | None
-    ) -> Iterator[Any]:
-        for future in _tracked([submit(function, *item) for item in arguments], title):
-            yield future.result()
-
-    try:
-        yield in_order
-    except BrokenProcessPool:
-        raise InputError(
-            "A worker process died (was it killed for lack of memory?). Finished shards are kept: "
-            "run the same command again, perhaps with fewer --workers."
-        ) from None
-    except BaseException:
-        # Killing them leaves no partial files: files are written whole or not at all.
-        for worker in multiprocessing.active_children():
-            worker.kill()
-        raise
-    finally:
-        executor.shutdown(wait=True, cancel_futures=True)
-
-
-def _in_process(
-    function: Callable[..., Any], arguments: list[Any], title: str | None
-) -> Iterator[Any]:
-    for item in _tracked(arguments, title):
-        yield function(*item)
-
-
-def _tracked(items: list[Any], title: str | None) -> Iterable[Any]:
-    """The items, with a progress bar on stderr if there is a title."""
-    if title is None or not items:
-        return items
-    from rich.console import Console
-    from rich.progress import track
-
-    return track(items, title, console=Console(stderr=True))
-
-
-def _start_worker() -> None:
-    warnings.simplefilter("ignore", RuntimeWarning)  # as in `warnings_as_sentences`
-    # llvmpipe's own threads would compete with the other workers for the same cores.
-    os.environ.setdefault("LP_NUM_THREADS", "1")
-    parent = multiprocessing.parent_process()
-
-    def end_with_parent() -> None:
-        wait([parent.sentinel])  # type: ignore[union-attr]
-        os._exit(1)
-
-    threading.Thread(target=end_with_parent, daemon=True).start()

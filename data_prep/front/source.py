@@ -19,7 +19,6 @@ from data_prep.engine.source import (
     Line,
     PreparedRoom,
     RoomTask,
-    Run,
     Survey,
     sentence_of,
 )
@@ -30,6 +29,7 @@ from data_prep.front.views import prepare_room, view_counts
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import file_stamp, read_text
 from sceneprior.core.furniture import model_categories, model_info_path
+from sceneprior.core.parallel import run_tasks
 from sceneprior.core.shards import SPLITS
 from sceneprior.render.offscreen import Renderer
 
@@ -76,14 +76,14 @@ class FrontSource:
             "models": digest_of_files([info]),
         }
 
-    def survey(self, run: Run) -> Survey:
+    def survey(self) -> Survey:
         """Read every house once, without meshes, and list the rooms to draw."""
         files = self._houses(self.only)
         found: list[tuple[str, str, int]] = []
         left_out: list[Line] = []
         starts = range(0, len(files), _HOUSES_PER_TASK)
-        arguments = [(self, files[i : i + _HOUSES_PER_TASK]) for i in starts]
-        for rooms, lost in run(_survey_houses, arguments, "reading houses"):
+        tasks = {f"houses from {files[i]}": (self, files[i : i + _HOUSES_PER_TASK]) for i in starts}
+        for rooms, lost in run_tasks(_survey_houses, tasks, "reading houses"):
             found += rooms
             left_out += lost
         if not found and not left_out:

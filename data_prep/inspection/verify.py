@@ -9,7 +9,6 @@ import numpy as np
 
 from data_prep.engine.plan import in_words
 from data_prep.engine.report import REPORT_NAME, Report, without_class
-from data_prep.engine.source import pool
 from data_prep.inspection.agreement import (
     Agreement,
     Limits,
@@ -27,6 +26,7 @@ from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
 from sceneprior.core.observations import RoomGroundTruth, RoomViews, observe
+from sceneprior.core.parallel import run_tasks
 from sceneprior.core.shard_writing import room_checksum
 from sceneprior.core.shards import Shard, list_shards, read_index, splits_of
 
@@ -88,7 +88,7 @@ def agreement_of(checks: Sequence[RoomCheck]) -> Agreement:
     return added(check.agreement for check in checks)
 
 
-def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> FolderCheck:
+def verify(folder: Path, room_id: str | None = None) -> FolderCheck:
     """Check the consistency of a folder of shards.
 
     With `room_id`, only this room is checked, and the counts of the index are not.
@@ -101,11 +101,12 @@ def verify(folder: Path, room_id: str | None = None, workers: int = 1) -> Folder
     problems = [f"{folder}: {failures}."] if failures and room_id is None else []
     rooms: dict[str, list[RoomCheck]] = {}
     for split in splits_of(folder):
-        paths = list_shards(folder, split)
-        with pool(workers) as run:
-            arguments = [(folder, path, name, room_id, usual, conventions) for path in paths]
-            parts = run(_check_shard, arguments, f"checking {split}")
-            rooms[split] = [room for part in parts for room in part]
+        tasks = {
+            str(path): (folder, path, name, room_id, usual, conventions)
+            for path in list_shards(folder, split)
+        }
+        parts = run_tasks(_check_shard, tasks, f"checking {split}")
+        rooms[split] = [room for part in parts for room in part]
     found = FolderCheck(rooms, (), unknown)
     if not found.every:
         raise InputError(

@@ -18,13 +18,13 @@ from data_prep.engine.source import (
     Line,
     PreparedRoom,
     RoomTask,
-    Run,
     Survey,
     sentence_of,
 )
 from data_prep.readers.annotations import LABEL_SET
 from data_prep.readers.rooms import FramedRoom, prepare_room
 from sceneprior.core.errors import InputError
+from sceneprior.core.parallel import run_tasks
 from sceneprior.core.shards import SPLITS
 from sceneprior.render.offscreen import Renderer
 
@@ -146,14 +146,14 @@ class Reader(ABC):
         options = self.options()
         return {"recipe": options, "seed": self.seed, **self.fingerprint(self._chosen(only))}
 
-    def survey(self, run: Run) -> Survey:
+    def survey(self) -> Survey:
         """List the rooms of every scene."""
         scenes = self._chosen(None if self.surveys_all else self.only)
         found: dict[str, FoundRoom] = {}
         scene_of: dict[str, str] = {}
         left_out: list[Line] = []
         word = self.scene_word[0]
-        looked = run(_look, [(self, scene) for scene in scenes], f"reading {word}s")
+        looked = run_tasks(_look, {scene: (self, scene) for scene in scenes}, f"reading {word}s")
         for scene, rooms in zip(scenes, looked, strict=True):
             if isinstance(rooms, str):
                 left_out.append(Line(scene, scene, "failed", reason=rooms))

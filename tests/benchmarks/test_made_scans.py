@@ -36,7 +36,7 @@ def folder(tmp_path_factory) -> Path:
     (path / "printed.txt").write_text(text.getvalue())
     lists = {name: out / f"{name}.txt" for name in ("train", "val")}
     source = ScanNet(out / "scans", labels=out / "labels.tsv", frame_step=1, **lists)
-    build_shards(Job(source, path / "shards", workers=1))
+    build_shards(Job(source, path / "shards"))
     return path
 
 

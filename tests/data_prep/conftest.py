@@ -9,6 +9,7 @@ from front_files import FrontFolder, four_models
 from typer.testing import CliRunner
 
 from data_prep.cli import add_commands
+from sceneprior.apps.cli.options import with_workers
 
 
 @pytest.fixture
@@ -21,7 +22,7 @@ def front(tmp_path: Path) -> FrontFolder:
 def cli():
     """Runs a command of data_prep."""
     app = typer.Typer()
-    add_commands(app)
+    add_commands(app, with_workers)
     return lambda *words: CliRunner().invoke(app, [str(word) for word in words])
 
 

@@ -8,6 +8,7 @@ from toy_rooms import LABEL_SET, make_toy_room
 
 from data_prep.engine.source import Line, PreparedRoom, RoomTask, Survey
 from sceneprior.core.errors import InputError
+from sceneprior.core.parallel import run_tasks
 from sceneprior.core.scene import Mesh
 
 TRIANGLE = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], dtype=np.int32))
@@ -29,8 +30,9 @@ class ToySource:
     def settings(self, only: str | None) -> dict[str, Any]:
         return {"rooms": self.rooms}
 
-    def survey(self, run: Any) -> Survey:
-        ids = [room_id for part in run(_list, [(0, 5), (5, self.rooms)], None) for room_id in part]
+    def survey(self) -> Survey:
+        parts = run_tasks(_list, {"few": (0, 5), "others": (5, self.rooms)})
+        ids = [room_id for part in parts for room_id in part]
         tasks = (
             RoomTask(room_id, "box", "test" if k % 5 == 4 else "train", extra={"number": k})
             for k, room_id in enumerate(ids)

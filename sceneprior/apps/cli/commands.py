@@ -10,6 +10,7 @@ import typer
 from data_prep.cli import add_commands
 from sceneprior import __version__
 from sceneprior.apps.cli import evaluation, rooms, runs
+from sceneprior.apps.cli.options import with_workers
 
 app = typer.Typer(
     name="sceneprior",
@@ -18,9 +19,9 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-add_commands(app)
+add_commands(app, with_workers)
 for command in (
-    runs.fit, evaluation.report,
+    with_workers(runs.fit), evaluation.report,
     rooms.synthesize, rooms.interpolate, rooms.complete, rooms.retrieve,
     rooms.reconstruct, evaluation.eval_svr,
     runs.pack, runs.priors, runs.export,

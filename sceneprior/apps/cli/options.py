@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from sceneprior.core.errors import InputError
+from sceneprior.core.parallel import on_workers
 from sceneprior.core.repeatable import LARGEST_SEED
 
 if TYPE_CHECKING:
@@ -127,6 +128,30 @@ def with_request(command: Callable[..., None]) -> Callable[..., None]:
         asked = request_of(**{name: values.pop(name) for name in shared})
         command(**values, asked=asked)
 
+    with_options.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
+    return with_options
+
+
+def with_workers(command: Callable[..., None], usual: int | None = 1) -> Callable[..., None]:
+    """Give a command the options `--workers`, `usual` if not given (None is one per core), and
+    `--scheduler`; its `run_tasks` works there."""
+    default = "all cores" if usual is None else "this process"
+    count = Annotated[int | None, option(f"Processes on this machine (default: {default}).", min=1)]
+    dask = Annotated[
+        str | None, option("Work on a Dask cluster instead: tcp://HOST:8786 (docs/cluster.md).")
+    ]
+    own = inspect.signature(command, eval_str=True)
+    shared = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=kind)
+        for name, kind in (("workers", count), ("scheduler", dask))
+    ]
+
+    @functools.wraps(command)
+    def with_options(workers: int | None, scheduler: str | None, **values: Any) -> None:
+        with on_workers(workers or usual, scheduler):
+            command(**values)
+
+    parameters = [*own.parameters.values(), *shared]
     with_options.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
     return with_options
 

@@ -2,6 +2,8 @@
 
 Boxes, shapes, walls and parts are lifted once and cached in files beside the shards. A file is
 found again when its inputs or its version changes, and is left out if the folder is not writable.
+Lifting is a task per shard (core/parallel.py), whose result stays in a file of its own until all
+shards are lifted.
 """
 
 import contextlib
@@ -14,8 +16,6 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from rich.console import Console
-from rich.progress import track
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
@@ -25,8 +25,9 @@ from sceneprior.core.classes import VOID
 from sceneprior.core.dataset import BLANK, RoomDataset, allowed_views
 from sceneprior.core.errors import ShardError
 from sceneprior.core.observations import RoomViews
+from sceneprior.core.parallel import run_tasks
 from sceneprior.core.parts import Parts, filled_cells
-from sceneprior.core.shards import Shard, iterate_rooms
+from sceneprior.core.shards import Shard
 from sceneprior.core.views import Batch
 from sceneprior.core.wall_lines import Wall, find_ceiling, find_walls
 from sceneprior.lifted.lifting import HANGS_M, LiftedBoxes, RayPool, ShapeGrid
@@ -86,9 +87,11 @@ class LiftedDataset(RoomDataset):
         super().__init__(rotations)
         folder = Path(folder)
         checksums: list[str | None] = []
+        paths: list[Path] = []
 
         def read(shard: Shard, room_id: str) -> RoomViews:
             checksums.append(shard.read_checksum(room_id))
+            paths.append(shard.path)
             return shard.read_room(room_id)
 
         rooms = self.read_rooms(folder, split, read)
@@ -101,13 +104,22 @@ class LiftedDataset(RoomDataset):
         self.object_classes = np.concatenate([room.object_class for room in rooms]).astype(np.int64)
         """Classes of all objects, room after room."""
         self._shape, self._parts_file = shape, folder / f"lifted_parts_{split}.npz"
-        inputs = _fingerprint(rooms, checksums, chosen)
-        self._key = f"{inputs} {VERSION} {shape.cells} {shape.margin}"
+        inputs = [*zip(rooms, checksums, chosen, strict=True)]
+        self._key = _key_of(inputs, shape)
+        tasks = {}
+        for path in dict.fromkeys(paths):
+            own = [given for given, found in zip(inputs, paths, strict=True) if found == path]
+            views = [allowed for *_, allowed in own]
+            tasks[str(path)] = (path, _key_of(own, shape), views, shape)
+        whole = folder / f"lifted_{split}.npz"
         found = _cached(
-            folder / f"lifted_{split}.npz",
+            whole,
             self._key,
-            lambda: _lift_rooms(folder, split, chosen, shape),
+            lambda: _joined(run_tasks(_lift_shard, tasks, "lifting objects from masks")),
         )
+        if whole.is_file():
+            for path, *_ in tasks.values():
+                _part_of(path).unlink(missing_ok=True)
         self.boxes = LiftedBoxes(*(found[name] for name in LiftedBoxes._fields))
         """Boxes of all objects, room after room."""
         self.rays = RayPool(*(found[name] for name in RayPool._fields))
@@ -232,40 +244,50 @@ class LiftedDataset(RoomDataset):
         )
 
 
-def _lift_rooms(
-    folder: Path, split: str, chosen: Sequence[Int[np.ndarray, " views"]], shape: ShapeGrid
+def _lift_shard(
+    path: Path, key: str, chosen: Sequence[Int[np.ndarray, " views"]], shape: ShapeGrid
 ) -> dict[str, np.ndarray]:
-    """The fields of `LiftedBoxes` and of a `RayPool` of all objects of a split, their visual hulls
+    """The fields of `LiftedBoxes` and of a `RayPool` of all objects of a shard, their visual hulls
     (`bits`, eight cells per byte), and the rooms' walls, from the `chosen` views of each room."""
+
+    def lift() -> dict[str, np.ndarray]:
+        with Shard(path) as shard:
+            rooms = zip(shard.room_ids, chosen, strict=True)
+            return _joined(_lift_room(shard, *room, shape) for room in rooms)
+
+    return _cached(_part_of(path), key, lift)
+
+
+def _part_of(shard: Path) -> Path:
+    return shard.with_suffix(".lifted.npz")
+
+
+def _lift_room(
+    shard: Shard, room_id: str, views: Int[np.ndarray, " views"], shape: ShapeGrid
+) -> dict[str, np.ndarray]:
     from sceneprior.lifted.lifting.boxes import draw_rays, lift_boxes
     from sceneprior.lifted.lifting.hidden_sides import planes_of
     from sceneprior.lifted.lifting.hulls import lift_shapes
 
-    found = []
-    progress = track(chosen, "lifting objects from masks (rooms)", console=Console(stderr=True))
-    for views, (shard, room_id) in zip(progress, iterate_rooms(folder, split), strict=True):
-        room = shard.read_room(room_id, images=True)
-        has_stuff = shard.has_stuff(room_id)
-        walls = find_walls(room, views)[0] if has_stuff else ()
-        ceiling_m = find_ceiling(room, walls, views) if has_stuff else None
-        # Half of the views suffice, and take half the time.
-        tops = () if ceiling_m is None else find_walls(room, views[::2], ceiling_m)[0]
-        planes = planes_of([*walls, *tops], ceiling_m)
-        allowed = np.isin(np.arange(len(room.visible)), views)
-        room = replace(room, visible=room.visible & allowed[:, None])
-        boxes = lift_boxes(room, planes)
-        hulls = lift_shapes(room, boxes, shape).reshape(-1, shape.cells**3)
-        rays = draw_rays(room, boxes, RAYS_KEPT, shape.margin)
-        half = {name: getattr(rays, name).astype(np.float16) for name in ("starts", "spans")}
-        found.append(
-            boxes._asdict() | half | {
-                "hits": rays.hits,
-                "bits": np.packbits(hulls, axis=1),
-                "walls": np.array([np.hstack(wall) for wall in walls]).reshape(-1, 7),
-                "wall_counts": np.array([len(walls)]),
-            }
-        )  # fmt: skip
-    return _joined(found)
+    room = shard.read_room(room_id, images=True)
+    has_stuff = shard.has_stuff(room_id)
+    walls = find_walls(room, views)[0] if has_stuff else ()
+    ceiling_m = find_ceiling(room, walls, views) if has_stuff else None
+    # Half of the views suffice, and take half the time.
+    tops = () if ceiling_m is None else find_walls(room, views[::2], ceiling_m)[0]
+    planes = planes_of([*walls, *tops], ceiling_m)
+    allowed = np.isin(np.arange(len(room.visible)), views)
+    room = replace(room, visible=room.visible & allowed[:, None])
+    boxes = lift_boxes(room, planes)
+    hulls = lift_shapes(room, boxes, shape).reshape(-1, shape.cells**3)
+    rays = draw_rays(room, boxes, RAYS_KEPT, shape.margin)
+    half = {name: getattr(rays, name).astype(np.float16) for name in ("starts", "spans")}
+    return boxes._asdict() | half | {
+        "hits": rays.hits,
+        "bits": np.packbits(hulls, axis=1),
+        "walls": np.array([np.hstack(wall) for wall in walls]).reshape(-1, 7),
+        "wall_counts": np.array([len(walls)]),
+    }  # fmt: skip
 
 
 def _cached(
@@ -274,7 +296,7 @@ def _cached(
     """Read the arrays cached in a file under this key. If they are missing, compute them, and cache
     them if the file is writable."""
     saved = kept_arrays(path)
-    if str(saved.get("key")) == key:
+    if str(saved.pop("key", None)) == key:
         return saved
     found = find()
     if path.parent.is_dir():  # no folder is created
@@ -283,20 +305,19 @@ def _cached(
     return found
 
 
-def _fingerprint(
-    rooms: Sequence[RoomViews], checksums: Sequence[str | None], chosen: Sequence[np.ndarray]
-) -> str:
-    """Hash of everything from which boxes and shapes are computed. A room's checksum covers its
-    images; for old shards without checksums, measurements taken from the images replace it."""
+def _key_of(rooms: Iterable[tuple[RoomViews, str | None, np.ndarray]], shape: ShapeGrid) -> str:
+    """Key of everything from which boxes and shapes are computed: rooms, their checksums and chosen
+    views. A checksum covers a room's images; for old shards without checksums, measurements taken
+    from the images replace it."""
     summary = hashlib.sha256(b"lifted 2")
-    for room, checksum, views in zip(rooms, checksums, chosen, strict=True):
+    for room, checksum, views in rooms:
         summary.update(f"{room.room_id} {checksum}".encode())
         for array in (
             room.object_class, room.boxes, room.mask_pixels, room.sides_clear,
             room.world_to_camera, room.intrinsics, views,
         ):  # fmt: skip
             summary.update(np.ascontiguousarray(array).data)
-    return summary.hexdigest()
+    return f"{summary.hexdigest()} {VERSION} {shape.cells} {shape.margin}"
 
 
 def _joined(items: Iterable[dict[str, Any]]) -> dict[str, np.ndarray]:

@@ -11,6 +11,7 @@ from toy_source import ToySource
 from data_prep.engine.build import Job, build_shards, read_finished
 from data_prep.inspection.agreement import true_bodies
 from sceneprior.core.classes import label_set
+from sceneprior.core.parallel import on_workers
 from sceneprior.core.shards import read_index
 
 TROUBLE = {1: "sentence", 2: "unforeseen", 3: "unreadable", 5: "shapes", 8: "filtered"}
@@ -20,8 +21,9 @@ def test_a_whole_job(front, tmp_path):
     three_houses(front)
     front.house("other", *(bedroom(f"Bedroom-{k}") for k in range(10)))  # more than one shard
     one, two, third = tmp_path / "one", tmp_path / "two", tmp_path / "three"
-    summary = build_shards(front_job(front, one, workers=1))
-    build_shards(front_job(front, two, workers=2))
+    summary = build_shards(front_job(front, one))
+    with on_workers(2):
+        build_shards(front_job(front, two))
     assert len(digests(one, "train/*.h5")) == 2 and digests(one) == digests(two)
     build_shards(front_job(front, third, seed=1))
     assert digests(third, "**/*.h5") != digests(one, "**/*.h5")
@@ -101,7 +103,8 @@ def test_a_source_that_draws_nothing_comes_through_the_same_door(tmp_path):
     index = read_index(one)
     assert (index["source"], index["renderer"], index["seed"]) == ("toy", None, None)
     assert (one / "models" / "toy.ply").is_file()
-    build_shards(Job(ToySource(), two, workers=2))
+    with on_workers(2):
+        build_shards(Job(ToySource(), two))
     assert digests(one) == digests(two)
     with refused("engine/other source", tmp=tmp_path):
         build_shards(Job(ToySource(11, name="other"), one))

@@ -99,7 +99,8 @@ def test_the_command_is_stopped_and_gone_on_with(front, tmp_path, start, how):
     script = tmp_path / "run.py"
     script.write_text(
         "import typer\nfrom data_prep.cli import add_commands\n"
-        "app = typer.Typer()\nadd_commands(app)\n"
+        "from sceneprior.apps.cli.options import with_workers\n"
+        "app = typer.Typer()\nadd_commands(app, with_workers)\n"
         "if __name__ == '__main__':\n    app()\n"
     )
     out = tmp_path / "shards"

@@ -10,7 +10,7 @@ from front_files import FrontFolder, bedroom, room
 from front_reading import shared_front
 from refusals import refused
 
-from data_prep.engine.source import Survey, pool
+from data_prep.engine.source import Survey
 from data_prep.front.furnished import ModelBank
 from data_prep.front.houses import read_house
 from data_prep.front.recipe import load_recipe
@@ -21,9 +21,8 @@ RULES_OFF = ("min_objects=null", "max_objects=null", "max_floor_m=null", "max_he
 
 
 def survey(front: FrontFolder, recipe: str, *rules: str, **options: Any) -> Survey:
-    with pool(1) as run:
-        source = FrontSource(front.front, front.future, load_recipe(recipe, rules), **options)
-        return source.survey(run)
+    source = FrontSource(front.front, front.future, load_recipe(recipe, rules), **options)
+    return source.survey()
 
 
 def flat(front: FrontFolder) -> None:

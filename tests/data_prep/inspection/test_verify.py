@@ -20,6 +20,7 @@ from data_prep.inspection.verify import FolderCheck, RoomCheck, verify
 from data_prep.readers.posed.reader import Posed
 from sceneprior.core.boxes import yaw_rotation
 from sceneprior.core.errors import sentence_of
+from sceneprior.core.parallel import on_workers
 
 RULES = ("views.per_m2=1.5", "views.image_size=[120, 160]")
 
@@ -36,7 +37,9 @@ def problems(name, shards):
 
 def test_a_right_folder_and_one_room_of_it(shards):
     found = verify(shards)
-    assert found.problems == () and verify(shards, workers=2) == found
+    assert found.problems == ()
+    with on_workers(2):
+        assert verify(shards) == found
     one = verify(shards, "house1_MasterBedroom-1")
     assert [room.room_id for room in one.every] == ["house1_MasterBedroom-1"]
     for split in ("train", "val", "test"):

@@ -10,7 +10,6 @@ import pytest
 from golden_values import FOLDER, TAKE
 from toy_formats import FORMATS, arrays_of, read
 
-from data_prep.engine.source import pool
 from data_prep.inspection.agreement import boxes_around, hull_of
 from data_prep.inspection.verify import array_problems, mask_problems
 from data_prep.readers.upright import own_sides
@@ -165,8 +164,7 @@ def told_of(source) -> list[str]:
     """Sentences of the rooms that are left out."""
     try:
         source.settings(None)
-        with pool(1) as run:
-            survey = source.survey(run)
+        survey = source.survey()
         for task in survey.rooms:
             source.prepare(task, None)
     except InputError as error:

@@ -19,7 +19,6 @@ from public_files import (
 from refusals import refused
 from scan_files import write_table
 
-from data_prep.engine.source import pool
 from data_prep.readers import open_reader
 from data_prep.readers.annotations import NYU40, SHELL, ids_and_classes
 from data_prep.readers.hypersim import pinhole, straight_grid
@@ -38,8 +37,7 @@ def prepared(name, folder, **settings):
 
 def survey(source):
     source.settings(source.only)
-    with pool(1) as run:
-        return source.survey(run)
+    return source.survey()
 
 
 def splits_of(source):

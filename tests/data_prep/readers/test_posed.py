@@ -8,7 +8,7 @@ from colmap_files import write_colmap
 from PIL import Image
 from posed_files import SET, PosedRoom, furniture, prepared
 
-from data_prep.engine.source import RoomTask, pool
+from data_prep.engine.source import RoomTask
 from data_prep.inspection.verify import array_problems, mask_problems
 from data_prep.readers.posed.reader import Posed
 from data_prep.readers.posed.recording import frame_intrinsics, room_name, seems_up
@@ -176,8 +176,7 @@ def source(rooms, tmp_path):
 
 
 def survey(source):
-    with pool(1) as run:
-        return source.survey(run)
+    return source.survey()
 
 
 def test_settings_follow_the_files(source, rooms):

@@ -21,7 +21,7 @@ from scan_files import frame_header, png, sens_bytes, sens_header, write_ply, wr
 from toy_formats import FORMATS
 
 from data_prep.engine.plan import read_splits
-from data_prep.engine.source import RoomTask, pool
+from data_prep.engine.source import RoomTask
 from data_prep.readers import DATA_SETS, open_reader
 from data_prep.readers.posed.formats import read_formats, read_label_set
 from data_prep.readers.posed.reader import Posed, find_rooms
@@ -447,8 +447,7 @@ def test_damaged_files_are_refused_in_one_sentence(tmp_path, name, damage):
     folder = tmp_path / "data"
     folder.mkdir()
     source = FORMATS[name](folder).source
-    with pool(1) as run:
-        (task,) = source.survey(run).rooms
+    (task,) = source.survey().rooms
     OTHERS[name][damage](folder)
     with refused(f"readers/{name} | {damage}", tmp=tmp_path):
         source.settings(None)

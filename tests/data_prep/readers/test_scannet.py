@@ -21,7 +21,7 @@ from scan_files import (
 )
 
 from data_prep.engine.build import Job, build_shards
-from data_prep.engine.source import RoomTask, pool
+from data_prep.engine.source import RoomTask
 from data_prep.inspection.verify import agreement_of, verify
 from data_prep.readers.annotations import read_labels
 from data_prep.readers.rooms import focal_and_center, unoccluded
@@ -58,8 +58,7 @@ def task_of(scan):
 
 
 def survey(reader):
-    with pool(1) as run:
-        return reader.survey(run)
+    return reader.survey()
 
 
 # -- Files -----------------------------------------------------------------------------------------

@@ -24,7 +24,7 @@ from room_scans import ROOM_TABLE, make_room_scan
 from scan_files import ScanFolder, make_scan, write_table
 from scipy.spatial.transform import Rotation
 
-from data_prep.engine.source import PreparedRoom, Source, pool
+from data_prep.engine.source import PreparedRoom, Source
 from data_prep.readers import open_reader
 from data_prep.readers.posed.reader import Posed
 from data_prep.readers.scannet import ScanNet
@@ -269,8 +269,7 @@ def read(
     change(folder)
     source = made_of.source
     source.settings(None)
-    with pool(1) as run:
-        (task,) = source.survey(run).rooms
+    (task,) = source.survey().rooms
     made = source.prepare(task, None)
     assert isinstance(made, PreparedRoom)
     return made, made_of
