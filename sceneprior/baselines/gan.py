@@ -239,7 +239,7 @@ def spread_out(layout: LayoutDecoder, features: Float[Tensor, "rooms objects wid
 
     Source: Salimans and Kingma, "Weight normalization", NeurIPS 2016, section 3.
     """
-    outputs = layout.mlp2(layout.mlp1(features)).flatten(0, 1)
+    outputs = layout.mlp2(layout.mlp1(features), features).flatten(0, 1)
     starts = [(0.0, 1.0)] * layout.classes + list(STARTS)
     rows = zip(layout.mlp2.rows(), outputs.unbind(dim=1), starts, strict=True)
     for (weight, bias), values, (mean, spread) in rows:

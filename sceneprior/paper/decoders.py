@@ -37,6 +37,14 @@ class JointHead(nn.Sequential):
             nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, classes + 7)
         )
 
+    def forward(
+        self,
+        shared: Float[Tensor, "rooms objects hidden"],
+        features: Float[Tensor, "rooms objects width"],
+    ) -> Float[Tensor, "rooms objects outputs"]:
+        """All outputs, from MLP1's output `shared`; x_k, `features`, is not read."""
+        return super().forward(shared)
+
     def rows(self) -> list[tuple[Tensor, Tensor]]:
         """Weights and bias of each output of the last layer, in the order of the outputs."""
         last: nn.Linear = self[-1]  # type: ignore[assignment]
@@ -44,33 +52,35 @@ class JointHead(nn.Sequential):
 
 
 class SeparateHeads(nn.Module):
-    """Replacement of MLP2: a linear layer for the classes and a separate MLP for each coordinate.
+    """The released code's replacement of MLP2: a linear layer for the classes and an MLP for each
+    coordinate on MLP1's output without a ReLU, and an MLP for completeness on x_k.
 
-    `hidden` is the size of MLP1's output and of each coordinate's hidden layer.
+    `hidden` is the size of MLP1's output and of each coordinate's hidden layer; `width` is D_z.
     """
 
-    def __init__(self, hidden: int, classes: int):
+    def __init__(self, width: int, hidden: int, classes: int):
         super().__init__()
         self.classes = nn.Linear(hidden, classes)
         self.coordinates = nn.ModuleList(
             mlp(nn.Linear(hidden, hidden), nn.Linear(hidden, 1))
             for _ in ("x", "y", "z", "width", "height", "depth")
         )
-        self.completeness = nn.Linear(hidden, 1)
+        self.completeness = mlp(nn.Linear(width, width // 4), nn.Linear(width // 4, 1))
 
     def forward(
-        self, shared: Float[Tensor, "rooms objects hidden"]
+        self,
+        shared: Float[Tensor, "rooms objects hidden"],
+        features: Float[Tensor, "rooms objects width"],
     ) -> Float[Tensor, "rooms objects outputs"]:
         """Class logits, x, y, z, width, height, depth and completeness, in the order of
-        `JointHead`."""
-        x = F.relu(shared)
-        parts = [self.classes(x), *(head(x) for head in self.coordinates), self.completeness(x)]
-        return torch.cat(parts, dim=-1)
+        `JointHead`, from MLP1's output `shared` and x_k, `features`."""
+        parts = [self.classes(shared), *(head(shared) for head in self.coordinates)]
+        return torch.cat([*parts, self.completeness(features)], dim=-1)
 
     def rows(self) -> list[tuple[Tensor, Tensor]]:
         """Weights and bias of each output of the last layers, in the order of the outputs."""
-        coordinates = (head[-1] for head in self.coordinates)  # type: ignore[index]
-        last = (self.classes, *coordinates, self.completeness)
+        mlps = (*self.coordinates, self.completeness)
+        last = (self.classes, *(head[-1] for head in mlps))  # type: ignore[index]
         return [row for layer in last for row in zip(layer.weight, layer.bias, strict=True)]
 
 
@@ -98,7 +108,9 @@ class LayoutDecoder(nn.Module):
         self.classes, self.void = classes, void
         self.mlp1 = mlp(nn.Linear(width, width), nn.Linear(width, hidden))
         self.mlp2 = (
-            SeparateHeads(hidden, classes) if heads == "separate" else JointHead(hidden, classes)
+            SeparateHeads(width, hidden, classes)
+            if heads == "separate"
+            else JointHead(hidden, classes)
         )
         # Section 3.4: every object starts at the floor centre. The weights are small rather than
         # zero, so that objects can separate; y starts slightly above 0, where ReLU has a gradient.
@@ -121,7 +133,7 @@ class LayoutDecoder(nn.Module):
         below the floor (supplement A). Sizes s_k are SoftPlus of MLP2's output.
         """
         shared = self.mlp1(features)
-        out = self.mlp2(shared)
+        out = self.mlp2(shared, features)
         logits, center, size, complete = out.split([self.classes, 3, 3, 1], dim=-1)
         if not self.void:
             is_void = torch.arange(self.classes, device=logits.device) == VOID

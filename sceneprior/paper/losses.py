@@ -4,8 +4,9 @@ Completeness scores have two conventions, for a room of n objects:
 
 - `first_n` (supplement B): 1 for the first n predictions, 0 after. A generated scene ends
   before its first prediction whose score is not above 0.5.
-- `stop` (released code): 1 from the n-th prediction on. A generated scene ends with its first
-  prediction whose score is above 0.5; it is never empty.
+- `stop` (released code): 1 from the n-th prediction on, up to the count of the fullest room of the
+  batch. A generated scene ends with its first prediction whose score is above 0.5; it is never
+  empty.
 """
 
 import torch
@@ -116,11 +117,13 @@ def box_loss(
 def completeness_loss(scenes: DecodedScenes, views: SceneViews, target: str) -> Float[Tensor, ""]:
     """L_p of Eq. 7: binary cross entropy of all completeness scores. `target` is the convention of
     their targets (`completeness_targets`)."""
-    logits = scenes.completeness_logits
-    wanted = completeness_targets(views.is_object.sum(dim=-1), logits.shape[1], target)
-    wanted = wanted.to(logits.dtype)
+    logits, counts = scenes.completeness_logits, views.is_object.sum(dim=-1)
+    wanted = completeness_targets(counts, logits.shape[1], target).to(logits.dtype)
     # Rooms that `SceneViews.padded` adds do not count.
     real = (views.room_index >= 0).to(logits.dtype).unsqueeze(1)
+    if target == "stop":
+        position = torch.arange(logits.shape[1], device=logits.device)
+        real = real * (position < counts.max())
     mean = F.binary_cross_entropy_with_logits(logits, wanted, real / real.mean())
     return mean * share_of_batch(views.is_object.any(dim=-1).sum())
 
@@ -189,6 +192,7 @@ def mask_loss(
     matches: Matches,
     iou_gate: float,
     per_room: bool = False,
+    passing_only: bool = False,
 ) -> tuple[Float[Tensor, "*rooms"], dict[str, Float[Tensor, "*rooms"]]]:
     """Binary cross entropy of visible masks whose IoU with the observation is high enough (Eq. 8).
 
@@ -197,7 +201,8 @@ def mask_loss(
     for each object j and its matched prediction k. The paper sums over views, with a gate of 0.5;
     here the loss is averaged over pixels, then over an object's views, then over objects.
 
-    A mask whose IoU with its observation is not above `iou_gate` counts as zero, as in the paper.
+    A mask whose IoU with its observation is not above `iou_gate` counts as zero, as in the paper;
+    with `passing_only`, the loss is the mean over the pairs above it, as in the released code.
     Void pixels are left out of BCE and IoU, since the object may or may not extend there.
 
     `rendered` holds the visible soft masks of all predictions, at the size of the views' instance
@@ -222,6 +227,8 @@ def mask_loss(
     per_object = mine.new_zeros(count.shape)
     per_object = per_object.index_put((room, item), each * use * share, accumulate=True)
     loss = mean_of_objects(per_object, count > 0, per_room)
+    if passing_only:
+        loss = mean_of_objects(each.unsqueeze(0), (iou > iou_gate).unsqueeze(0))
     if per_room:
         pairs = count.sum(dim=1).clamp(min=1)
         ious, used = (mine.new_zeros(len(count)).index_add(0, room, v) / pairs for v in (iou, use))

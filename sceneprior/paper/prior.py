@@ -165,16 +165,17 @@ class ModelConfig(Section):
     latent_space: Annotated[SphereConfig | CubeConfig, Field(discriminator="name")] = SphereConfig()
     decoder: DecoderConfig
     layout_heads: Literal["joint", "separate"] = "joint"
-    """MLP2 is one MLP for all outputs (`joint`), or a linear layer for the classes and separate
-    MLPs for x, y, z, width, height and depth (`separate`, released code)."""
+    """MLP2 is one MLP for all outputs (`joint`), or as in the released code: a linear layer for the
+    classes, separate MLPs for x, y, z, width, height and depth, and one for completeness that reads
+    x_k instead of MLP1's output (`separate`)."""
     floor_gradient: bool = False
     """If true, an object that the ReLU of Eq. S1 keeps on the floor can still learn to leave it
     (`above_floor`). With the paper's ReLU (false) it cannot, and lamps may stay on the floor."""
     completeness_target: Literal["first_n", "stop"] = "first_n"
     """Targets of the completeness scores of n objects. `first_n`: 1 for the first n predictions, 0
     after (supplement B). `stop`: 1 from the n-th prediction on; a generated scene then ends with
-    its first prediction above 0.5 (main text, released code). Decoding follows the same
-    convention."""
+    its first prediction above 0.5 (main text, released code), and scores beyond the fullest room of
+    the batch do not count. Decoding follows the same convention."""
     shape: ShapeModuleConfig
 
     @model_validator(mode="after")

@@ -29,6 +29,9 @@ class LossConfig(Section):
     at 0, objects may extend behind others without limit."""
     iou_gate: float = Field(0.5, ge=0, lt=1)
     """Masks enter L_S (Eq. 8) only if their IoU with the observed mask is above this value."""
+    passing_masks_only: bool = False
+    """Average L_S over the pairs of masks that pass the gate, as in the released code. If false,
+    the others count as 0 (Eq. 8). It has no effect when rooms are fitted to images."""
 
 
 class LatentStageConfig(TrainConfig):
@@ -72,6 +75,11 @@ class StageConfig(LatentStageConfig):
     Adam."""
 
     schedule: Annotated[Steps | Cosine, Field(discriminator="name")] = Steps()
+    latent_epochs: int = Field(0, ge=0)
+    """The last of the `epochs` train the latents alone; the released code adds 50 such epochs."""
+    keep_lowest_loss: bool = False
+    """End the stage with the weights of the epoch with the lowest training loss (released code),
+    not with those of the last epoch. Checkpoints are then twice as large."""
     proxy: Literal["ellipsoid", "beveled_box"] = "ellipsoid"
     """Shape from which an object's 2D box is computed where its mesh is not used (see `box_from`),
     in training from views and when rooms are fitted to images. `ellipsoid`: the ellipsoid inscribed

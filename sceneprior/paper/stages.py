@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from sceneprior.core.errors import InputWarning
 from sceneprior.core.views import DecodedScenes, SceneViews
 from sceneprior.paper.losses import layout_losses, mask_loss, seen_masks
-from sceneprior.paper.matching import seen_boxes
+from sceneprior.paper.matching import Matches, seen_boxes
 from sceneprior.paper.prior import ScenePrior
 from sceneprior.paper.settings import (
     LatentStageConfig,
@@ -110,6 +110,8 @@ class PaperStage(LatentStage):
     loss: LossConfig
     static: StaticStep | None = None
     _unchecked: tuple[OnHost, tuple[str, ...]] | None = None
+    _lowest: tuple[float, dict[str, Tensor]] | None = None
+    """Loss and weights of the epoch with the lowest loss, for `keep_lowest_loss`."""
 
     def use_graphs(self, trainer: lightning.Trainer) -> bool:
         """Use CUDA graphs if the settings and the trainer allow; says why not on a GPU."""
@@ -144,8 +146,27 @@ class PaperStage(LatentStage):
             self._check_last()
         return total
 
+    def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
+        if self.current_epoch >= self.stage.epochs - self.stage.latent_epochs:
+            for parameter in self.prior.parameters():
+                parameter.grad = None  # not trained
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Remember the weights of the epoch that ends, if its loss is the lowest so far."""
+        if self.stage.keep_lowest_loss and self.trainer.training:
+            loss = float(self.trainer.callback_metrics["train/loss"])  # read by all processes
+            if self._lowest is None or loss < self._lowest[0]:
+                weights = {name: value.clone() for name, value in self.state_dict().items()}
+                self._lowest = loss, weights
+            checkpoint["lowest_loss"] = self._lowest
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        self._lowest = checkpoint.get("lowest_loss")
+
     def on_train_end(self) -> None:
         self._check_last()  # training may end within an epoch
+        if self._lowest is not None:
+            self.load_state_dict(self._lowest[1])
 
     def _check_last(self) -> None:
         if self._unchecked is not None:
@@ -197,13 +218,17 @@ class ShapeStage(PaperStage):
             masks = self._masks(scenes, views)  # drawn while the host solves the assignment
             matches = static.matches(cost, views)
             losses = static.losses(scenes, boxes, views, matches)
-            losses["mask"], overlap = mask_loss(masks, views, matches, self.loss.iou_gate)
+            losses["mask"], overlap = self._mask_loss(masks, views, matches)
             return self.total(losses, len(views.room_ids), **overlap)
 
     def _masks(self, scenes: DecodedScenes, views: SceneViews) -> Tensor:
         faces = self.prior.shape.faces
         assert scenes.vertices_m is not None and faces is not None, "masks are of meshes"
         return seen_masks(scenes.vertices_m, faces, views, self.stage)
+
+    def _mask_loss(self, masks: Tensor, views: SceneViews, matches: Matches) -> Any:
+        gate, passing_only = self.loss.iou_gate, self.loss.passing_masks_only
+        return mask_loss(masks, views, matches, gate, passing_only=passing_only)
 
     def eager_step(self, views: SceneViews, batch_idx: int) -> Tensor:
         # In a room of n objects, only the first n predictions are matched and rendered.
@@ -215,7 +240,7 @@ class ShapeStage(PaperStage):
                 scenes, boxes, views, self.loss, self.completeness_target
             )
             masks = self._masks(scenes, views)
-            losses["mask"], overlap = mask_loss(masks, views, matches, self.loss.iou_gate)
+            losses["mask"], overlap = self._mask_loss(masks, views, matches)
             total = self.total(losses, len(views.room_index), **overlap)
             check_finite(total, views.room_ids)
             return total

@@ -44,13 +44,15 @@ class TransformerConfig(DecoderConfig):
     """Dropout rate, applied at the same places as in the library that the paper builds on; 0.1 is
     that library's default."""
     final_norm: bool = False
-    """Add a layer norm after the encoder layer and after the decoder layer, as in the released code
-    (a default of the library that it builds on)."""
+    """Add a layer norm after the encoder layer and after the decoder layer: the default of the
+    library that the paper builds on, and the released code's."""
+    unit_start: bool = False
+    """Initialise the start token x_0 from N(0, 1), as in the released code, not N(0, 1 / D_z)."""
     query_self_attention: bool = False
     """Give the decoder layer self-attention over its single query z, as in the released code."""
     step_mlps: bool = False
-    """End each step k with a separate two-layer MLP, as in the released code: 0.5 million weights
-    per step at width 512. Features then depend on k."""
+    """End each step k with a separate two-layer MLP, a ReLU after each layer, as in the released
+    code: 0.5 million weights per step at width 512. Features then depend on k."""
 
     def build(self, width: int, max_objects: int) -> "SceneTransformer":
         return SceneTransformer(width, self, max_objects)
@@ -84,7 +86,7 @@ class SceneTransformer(nn.Module):
         hidden = config.hidden
         self.heads = config.heads
         self.dropout = config.dropout
-        self.start = nn.Parameter(torch.randn(width) / width**0.5)
+        self.start = nn.Parameter(torch.randn(width) / (1 if config.unit_start else width**0.5))
         self.encoder_qkv = nn.Linear(width, 3 * width)
         self.encoder_out = nn.Linear(width, width)
         self.encoder_norm = nn.LayerNorm(width)
@@ -103,7 +105,9 @@ class SceneTransformer(nn.Module):
         self.output: nn.ModuleDict | None = None
         if config.step_mlps:  # the output of step k's MLP is x_k, which later steps read, too
             steps = [
-                nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, width))
+                nn.Sequential(
+                    nn.Linear(width, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU()
+                )
                 for _ in range(max_objects)
             ]
             self.output = nn.ModuleDict({"mlps": nn.ModuleList(steps)})
