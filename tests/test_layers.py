@@ -45,7 +45,7 @@ BUDGET = {
     "sceneprior/furniture": (591, 4),
     "sceneprior/render": (4629, 23),
     "sceneprior/training": (1286, 7),
-    "sceneprior/paper": (2697, 13),
+    "sceneprior/paper": (2754, 13),
     "sceneprior/lifted": (8784, 43),
     "sceneprior/baselines": (2909, 14),
     "sceneprior/evaluation": (4411, 21),

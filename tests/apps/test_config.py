@@ -59,6 +59,7 @@ def test_the_papers_numbers(name, objects, classes, mask_step):
     model = config.model
     assert (model.max_objects, model.width) == (objects, 512)
     assert (model.decoder.heads, model.decoder.hidden, model.decoder.dropout) == (4, 1024, 0.1)
+    assert model.decoder.final_norm and not model.decoder.query_self_attention
     assert (config.data.views_per_room, config.data.mask_step) == (20, mask_step)
     assert config.data.augment_rotations and config.data.view_fraction == 1
     for stage, epochs in ((config.layout, 800), (config.shape, 500)):
@@ -71,20 +72,71 @@ def test_the_papers_numbers(name, objects, classes, mask_step):
     assert (loss.match_box, loss.iou_gate, loss.occlusion_slack) == (5.0, 0.5, 1.0)
     assert config.layout.proxy == "ellipsoid" and config.shape.compositing == "paper"
     assert (model.shape.template, model.shape.fit_box, model.shape.level) == ("sphere", False, 4)
+    assert (config.shape.silhouettes, config.shape.box_from) == ("exact", "mesh")
+
+
+def settings_of(name: str) -> dict[str, object]:
+    def flat(data, prefix=""):
+        for key, value in data.items():
+            yield from (
+                flat(value, f"{prefix}{key}.")
+                if isinstance(value, dict)
+                else [(prefix + key, value)]
+            )
+
+    return dict(flat(load_config(name).model_dump(mode="json", by_alias=True)))
+
+
+@pytest.mark.parametrize("room", ["bedroom", "living"])
+def test_the_head_of_a_small_config_names_each_key_that_is_not_the_papers(room):
+    paper, small = settings_of(f"paper/{room}.yaml"), settings_of(f"paper/{room}_small.yaml")
+    head = find_config(f"paper/{room}_small.yaml").read_text().split("method:")[0]
+    changed = {key for key in paper if paper[key] != small[key]}
+    assert paper.keys() == small.keys() and changed
+    assert [key for key in sorted(changed) if key not in head] == []
+    kept = ("loss.", "layout.", "model.latent_space.", "model.decoder.dropout", "sampling.")
+    assert not [key for key in changed if key.startswith(kept)]
+
+
+def test_the_released_codes_numbers():
+    """What the code that the authors released has of its own, and nothing else."""
+    paper, released = settings_of("paper/bedroom.yaml"), settings_of("paper/released.yaml")
+    assert {key: released[key] for key in paper if released[key] != paper[key]} == {
+        "data.augment_rotations": False,
+        "model.max_objects": 15,
+        "model.decoder.hidden": 512,
+        "model.decoder.query_self_attention": True,
+        "model.decoder.step_mlps": True,
+        "model.layout_heads": "separate",
+        "model.completeness_target": "stop",
+        "loss.passing_masks_only": True,
+        "layout.epochs": 850,
+        "layout.latent_epochs": 50,
+        "layout.batch_size": 128,
+        "layout.schedule.milestones": [400],
+        "layout.keep_lowest_loss": True,
+        "shape.epochs": 550,
+        "shape.latent_epochs": 50,
+        "shape.keep_lowest_loss": True,
+    }
 
 
 @pytest.mark.parametrize("path", PRIORS, ids=name_of)
 def test_no_shipped_config_is_a_variant_an_ablation_or_draws_near_copies(path):
     config = load_config(str(path))
     assert config.distribution in ("paper", "sampler")
-    model = config.model
+    model, released = config.model, path.stem == "released"
     assert config.stage_names[:2] in (("layout", "shape"), ("shape",), ("shape", "sampler"))
     assert config.method == "lifted" or config.layout is not None, "one stage is ablation c3"
-    assert model.completeness_target == "first_n"
-    names = (model.latent_space.name, model.decoder.name, model.layout_heads)
-    assert names == ("sphere", "transformer", "joint")
+    assert (model.latent_space.name, model.decoder.name) == ("sphere", "transformer")
     decoder = model.decoder
-    assert not (decoder.final_norm or decoder.query_self_attention or decoder.step_mlps)
+    parts = (
+        model.completeness_target == "stop", model.layout_heads == "separate",
+        decoder.query_self_attention, decoder.step_mlps,
+    )  # fmt: skip
+    assert set(parts) == {released}
+    of_paper = path.parent.name == "paper" and not path.stem.endswith("_tuned")
+    assert decoder.final_norm == decoder.unit_start == of_paper
 
 
 def test_a_former_section_that_asks_for_nothing_is_dropped(config):

@@ -46,20 +46,24 @@ def test_no_box_reaches_below_the_floor_whatever_the_weights(torch_rng, heads):
     assert (layout.sizes_m >= 0).all()
 
 
-def test_separate_heads_give_each_coordinate_an_mlp(torch_rng):
+def test_separate_heads_read_mlp1_without_a_relu_and_completeness_reads_the_feature(torch_rng):
     torch.manual_seed(0)
-    model = SeparateHeads(8, 4).double()
+    model = SeparateHeads(16, 8, 4).double()
     shared = torch.randn(2, 3, 8, generator=torch_rng, dtype=torch.float64)
-    out = model(shared)
+    features = torch.randn(2, 3, 16, generator=torch_rng, dtype=torch.float64)
+    out = model(shared, features)
     assert out.shape == (2, 3, 11)
     for room in range(2):
         for item in range(3):
-            x = shared[room, item].clamp(min=0)
+            x = shared[room, item]
             wanted = [*(model.classes.weight @ x + model.classes.bias)]
             for first, _, last in model.coordinates:
                 hidden = (first.weight @ x + first.bias).clamp(min=0)
                 wanted.append(last.weight[0] @ hidden + last.bias[0])
-            wanted.append(model.completeness.weight[0] @ x + model.completeness.bias[0])
+            first, _, last = model.completeness
+            assert first.out_features == 4, "128 of 512"
+            hidden = (first.weight @ features[room, item] + first.bias).clamp(min=0)
+            wanted.append(last.weight[0] @ hidden + last.bias[0])
             assert_close(out[room, item], torch.stack(wanted), rtol=0, atol=1e-12)
 
 

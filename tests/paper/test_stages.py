@@ -1,9 +1,16 @@
-"""The optimiser of the paper's stages: which rate trains what, and when it falls."""
+"""The paper's stages: which rate of Adam trains what, and when it falls; the released code's epochs
+of latents alone, and its weights of the lowest loss."""
+
+import csv
 
 import pytest
+import torch
+from interrupting import CPU, interrupted
 from tiny_runs import tiny_config
 
 from sceneprior.paper.stages import LayoutStage, ShapeStage
+from sceneprior.training.fit import fit
+from sceneprior.training.method import read_checkpoint
 
 
 def test_adam_has_a_rate_for_each_part_and_all_fall_tenfold_at_the_milestone(tmp_path):
@@ -14,6 +21,8 @@ def test_adam_has_a_rate_for_each_part_and_all_fall_tenfold_at_the_milestone(tmp
     stage = LayoutStage(config, config.layout, prior, latents)
     of = stage.configure_optimizers()
     groups, schedule = of["optimizer"].param_groups, of["lr_scheduler"]
+    assert type(of["optimizer"]) is torch.optim.Adam
+    assert {(group["betas"], group["weight_decay"]) for group in groups} == {((0.9, 0.999), 0)}
     seen = []
     for _ in range(4):
         seen.append([group["lr"] for group in groups])
@@ -29,3 +38,34 @@ def test_adam_has_a_rate_for_each_part_and_all_fall_tenfold_at_the_milestone(tmp
     assert trained | shape >= {id(p) for p in (*prior.decoder.parameters(), latents.weight)}
     ShapeStage(config, config.shape, prior, latents)
     assert all(p.requires_grad for p in prior.shape.parameters())
+
+
+def trained(config, run):
+    """The weights that the layout stage ends with, and the loss of each epoch."""
+    fit(config, run, trainer_options=CPU, loggers=("csv",), resume=run.exists())
+    with (run / "layout" / "metrics.csv").open(newline="") as file:
+        losses = [float(row["train/loss"]) for row in csv.DictReader(file)]
+    return read_checkpoint(run / "layout" / "final.ckpt")["state_dict"], losses
+
+
+def test_the_last_epochs_train_the_latents_alone(toy_shards, tmp_path):
+    few = {"layout__epochs": 2, "shape__epochs": 1}
+    before, _ = trained(tiny_config(toy_shards, **few), tmp_path / "before")
+    few |= {"layout__epochs": 4, "layout__latent_epochs": 2}
+    after, _ = trained(tiny_config(toy_shards, **few), tmp_path / "after")
+    changed = [name for name in before if not torch.equal(before[name], after[name])]
+    assert changed == ["latents.weight"]
+
+
+def test_the_weights_of_the_lowest_loss_are_kept_over_a_stop(toy_shards, tmp_path):
+    """With too high a rate, the loss of the last epoch is not the lowest."""
+    few = {"layout__learning_rate": 0.3, "layout__epochs": 5, "shape__epochs": 1}
+    config = tiny_config(toy_shards, **few, layout__keep_lowest_loss=True)
+    interrupted(config, tmp_path / "kept", "layout", 4)
+    kept, losses = trained(config, tmp_path / "kept")
+    best = losses.index(min(losses))
+    assert len(losses) == 5 and best < 4
+    plain, _ = trained(
+        tiny_config(toy_shards, **few | {"layout__epochs": best + 1}), tmp_path / "plain"
+    )
+    assert all(torch.equal(kept[name], plain[name]) for name in plain)

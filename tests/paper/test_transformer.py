@@ -168,6 +168,17 @@ def test_a_step_is_torchs_encoder_and_decoder_layer_their_norms_and_the_steps_ml
         assert (answer - wanted).abs().max() > 0.1
 
 
+def test_the_released_steps_end_in_a_relu_and_its_start_token_is_a_unit_normal(torch_rng):
+    model = decoder(parts=RELEASED).eval()
+    features = model(inputs(torch_rng)[0], 7)
+    assert (features == 0).any(dim=-1).all() and (features > 0).any(dim=-1).all()
+    assert not (features < 0).any()
+    for unit, deviation in ((True, 1.0), (False, 1 / 64)):
+        torch.manual_seed(0)
+        start = TransformerConfig(unit_start=unit).build(4096, 1).start
+        assert float(start.detach().std()) == pytest.approx(deviation, rel=0.06)  # 5 sigma
+
+
 @pytest.mark.parametrize("p", [0.1, 0.7])
 def test_each_number_is_dropped_alone_and_as_often_as_asked(p):
     torch.manual_seed(0)

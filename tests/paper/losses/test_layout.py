@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from references import losses as by_hand
+from torch.nn import functional as F
 
 from sceneprior.core.boxes import box_corners
 from sceneprior.core.cameras import boxes_of_points
@@ -20,6 +21,7 @@ from sceneprior.paper.losses import (
 )
 from sceneprior.paper.matching import match_objects
 from sceneprior.paper.settings import LossConfig
+from sceneprior.training.steps import weighted_sum
 
 OVERSHOOT = (1.0, 0.3)
 
@@ -71,6 +73,26 @@ def test_all_four_terms_are_their_loops(batch, overshoot):
     assert list(losses) == list(wanted)
     for name, loss in losses.items():
         assert float(loss) == pytest.approx(wanted[name], rel=1e-12), name
+
+
+def test_stop_flags_count_up_to_the_fullest_room(batch):
+    """Four of the five predictions: the fullest room holds four objects."""
+    logits, targets = batch.scenes.completeness_logits, ((0, 0, 0, 1), (0, 1, 1, 1), (0, 0, 1, 1))
+    wanted = [
+        F.binary_cross_entropy_with_logits(logits[room, k], logits.new_tensor(target))
+        for room, row in enumerate(targets)
+        for k, target in enumerate(row)
+    ]
+    found = completeness_loss(batch.scenes, batch.views, "stop")
+    assert float(found) == pytest.approx(float(sum(wanted)) / 12, rel=1e-12)
+
+
+def test_the_weights_of_the_losses_are_those_of_section_4():
+    terms = {"class": 1.0, "box": 10.0, "completeness": 100.0, "frustum": 1e3, "mask": 1e4}
+    losses = {name: torch.tensor(value) for name, value in terms.items()}
+    assert float(weighted_sum(losses, LossConfig())) == 1 + 5 * 10 + 100 + 1000 + 2 * 10000
+    per_room = {name: torch.tensor([value, 0.0]) for name, value in losses.items()}
+    assert weighted_sum(per_room, LossConfig(box=0.5)).tolist() == [21106.0, 0.0]
 
 
 def test_nothing_seen_is_zero_loss_not_nan(batch):

@@ -27,10 +27,12 @@ def masks(batch, seed=0, sharp=1.0):
 
 @pytest.mark.parametrize("gate", [0.0, 0.3, 0.5, 0.99])
 def test_the_mask_loss_is_its_loop(batch, gate):
+    """A pair that fails the gate counts as 0; with `passing_only`, it does not count."""
     rendered, matches = masks(batch)
     views = batch.views
     loss, log = mask_loss(rendered, views, matches, gate)
-    objects, ious, used = [], [], 0
+    released, _ = mask_loss(rendered, views, matches, gate, passing_only=True)
+    objects, ious, used, passing = [], [], 0, []
     for room, item in matches.valid.nonzero().tolist():
         slot = int(matches.prediction[room, item])
         each = []
@@ -42,8 +44,10 @@ def test_the_mask_loss_is_its_loop(batch, gate):
             passed = ious[-1] > gate
             used += passed
             each.append(by_hand.mask_cross_entropy(mine, observed) if passed else 0.0)
+            passing += each[-1:] * passed
         objects.append(sum(each) / len(each))
     assert float(loss) == pytest.approx(sum(objects) / len(objects), rel=1e-6)
+    assert float(released) == pytest.approx(sum(passing) / max(len(passing), 1), rel=1e-6)
     assert float(log["mask_iou"]) == pytest.approx(sum(ious) / len(ious), rel=1e-9)
     assert float(log["mask_used"]) == pytest.approx(used / len(ious))
     assert {0.0: used == len(ious), 0.99: used == 0}.get(gate, 0 < used < len(ious))
