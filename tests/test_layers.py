@@ -41,16 +41,16 @@ MAY_TOO = {
 
 BUDGET = {
     "data_prep": (12714, 60),
-    "sceneprior/core": (6611, 30),
+    "sceneprior/core": (6619, 30),
     "sceneprior/furniture": (591, 4),
     "sceneprior/render": (4629, 23),
-    "sceneprior/training": (1286, 7),
-    "sceneprior/paper": (2754, 13),
-    "sceneprior/lifted": (8784, 43),
-    "sceneprior/baselines": (2909, 14),
+    "sceneprior/training": (1515, 9),
+    "sceneprior/paper": (2767, 13),
+    "sceneprior/lifted": (8783, 43),
+    "sceneprior/baselines": (2911, 14),
     "sceneprior/evaluation": (4411, 21),
     "sceneprior/interchange": (899, 5),
-    "sceneprior/apps": (6789, 39),
+    "sceneprior/apps": (6792, 39),
 }
 """Most lines and modules of a folder. They go down freely, and up only in a commit that says what
 it bought and what went for it."""

@@ -42,7 +42,7 @@ RUN_HERE = [
     "docs/uses.md", "docs/reconstruction.md", "docs/evaluation.md", "docs/cluster.md",
     "docs/comparing.md", "docs/baselines_2d.md", "docs/baselines_3d.md",
     "docs/baselines_single_view.md", "docs/paper_map.md", "docs/requests.md", "docs/simulators.md",
-    "docs/captures.md",
+    "docs/captures.md", "docs/training.md",
 ]  # fmt: skip
 WHOLE_PAGES = {
     "docs/posed_data.md": "tests/data_prep/readers/test_posed_docs.py",

@@ -7,10 +7,10 @@ boxes never open them (tests/baselines/test_true_boxes.py).
 
 import math
 from abc import ABC, abstractmethod
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-import lightning
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -28,6 +28,7 @@ from sceneprior.core.views import RoomBoxes, SceneViews
 from sceneprior.paper.losses import share_of_batch
 from sceneprior.training.method import RunConfig, Stage, TrainConfig, TrainedSampler, ready_copy
 from sceneprior.training.steps import check_finite, log_losses, with_cosine
+from sceneprior.training.validation import ValidatedModule
 
 
 class OneStageTraining(TrainConfig):
@@ -54,8 +55,8 @@ class OneStageConfig(RunConfig):
         training rooms, if the method needs any."""
 
     @abstractmethod
-    def open_rooms(self) -> Any:
-        """The training rooms.
+    def open_rooms(self, split: str = "train") -> Any:
+        """The rooms of a split.
 
         Raises:
             InputError: they do not fit the config.
@@ -67,14 +68,15 @@ class OneStageConfig(RunConfig):
         return self.make()
 
     def stages(self) -> tuple[Stage, ...]:
-        return (Stage(self.method, self.training, self.open_rooms, self.build),)
+        val = partial(self.open_rooms, "val")
+        return (Stage(self.method, self.training, self.open_rooms, self.build, val),)
 
     def networks(self, stage: str, rooms: int) -> nn.ModuleDict:
         torch.manual_seed(self.seed)
         return nn.ModuleDict({"prior": self.make().prior})
 
 
-class OneStage(lightning.LightningModule, ABC):
+class OneStage(ValidatedModule, ABC):
     """Minimises a weighted sum of losses with Adam."""
 
     def __init__(self, prior: Any, config: OneStageConfig):
@@ -186,8 +188,8 @@ class BoxConfig(OneStageConfig):
     def learns_from(self) -> str:
         return "true boxes in 3D"
 
-    def open_rooms(self) -> TruthDataset:
-        rooms = TruthDataset(Path(self.data.shards), "train", self.data.rotations)
+    def open_rooms(self, split: str = "train") -> TruthDataset:
+        rooms = TruthDataset(Path(self.data.shards), split, self.data.rotations)
         self.check_rooms(rooms, getattr(self.model, "max_objects", None))
         return rooms
 

@@ -1,5 +1,6 @@
 """Data sets that hold the rooms of one split in memory and make batches of their views."""
 
+import copy
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -104,6 +105,10 @@ class RoomDataset(Dataset):
     def __len__(self) -> int:
         return len(self.plain_ids) * self.rotations
 
+    def for_validation(self) -> "RoomDataset":
+        """The same rooms, in what training does not use of them, if anything."""
+        return self
+
     @property
     def room_ids(self) -> tuple[str, ...]:
         """Ids of the rows: the room's id, with `@90` and so on for rotated copies."""
@@ -159,16 +164,11 @@ class FlatViews(Batch):
         )
 
 
-def allowed_views(
-    seed: int, room: int, count: int, fraction: float, held_out: bool = False
-) -> Int64[np.ndarray, " views"]:
-    """Indices of a room's views that training may use: a random share, determined by `seed`.
-
-    With `held_out`, return the indices of the other views.
-    """
+def allowed_views(seed: int, room: int, count: int, fraction: float) -> Int64[np.ndarray, " views"]:
+    """Indices of a room's views that training may use: a random share, determined by `seed`."""
     keep = max(1, round(fraction * count))
     order = np.random.default_rng([seed, room]).permutation(count)
-    return np.sort(order[keep:] if held_out else order[:keep])
+    return np.sort(order[:keep])
 
 
 class ViewDataset(RoomDataset):
@@ -180,8 +180,6 @@ class ViewDataset(RoomDataset):
     Args:
         views_per_room: Number of views sampled each time a room is drawn.
         view_fraction: Share of each room's views that may be sampled, chosen once by `seed`.
-        held_out: Sample from the remaining views, which training does not use; every room must have
-            at least one.
         mask_step: Downsampling step of the instance ids; None reads no images.
     """
 
@@ -196,7 +194,6 @@ class ViewDataset(RoomDataset):
         view_fraction: float = 1.0,
         mask_step: int | None = None,
         seed: int = 0,
-        held_out: bool = False,
     ):
         super().__init__(rotations)
         self.views_per_room, self.seed = views_per_room, seed
@@ -212,10 +209,21 @@ class ViewDataset(RoomDataset):
         self._image_sizes = tuple(room.image_size for room in rooms)
         self._object_counts = np.array([len(room.object_class) for room in rooms])
         self.max_objects = int(self._object_counts.max())
+        self._view_counts = [len(room.visible) for room in rooms]
         self._allowed = [
-            allowed_views(seed, index, len(room.visible), view_fraction, held_out)
+            allowed_views(seed, index, len(room.visible), view_fraction)
             for index, room in enumerate(rooms)
         ]
+
+    def for_validation(self) -> "ViewDataset":
+        """The same rooms in the views that training does not use, if every room has some; else this
+        data set."""
+        others = copy.copy(self)
+        others._allowed = [
+            np.setdiff1d(np.arange(count), used)
+            for count, used in zip(self._view_counts, self._allowed, strict=True)
+        ]
+        return others if all(map(len, others._allowed)) else self
 
     def to(self, device: torch.device | str) -> "ViewDataset":
         """Move boxes and cameras to `device`, where batches are then made."""

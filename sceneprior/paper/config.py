@@ -52,10 +52,13 @@ class PaperConfig(PriorConfig):
         views = self.data.views_per_room
         boxes = partial(self.open_views, views, None)
         masks = partial(self.open_views, self.shape.views_per_room or views, self.data.mask_step)
-        shape = Stage("shape", self.shape, masks, partial(self._build, self.shape))
+        shape = Stage(
+            "shape", self.shape, masks, partial(self._build, self.shape), partial(masks, "val")
+        )
         if self.layout is None:
             return (shape,)
-        return Stage("layout", self.layout, boxes, partial(self._build, self.layout)), shape
+        build = partial(self._build, self.layout)
+        return Stage("layout", self.layout, boxes, build, partial(boxes, "val")), shape
 
     def _build(
         self, stage: StageConfig, rooms: ViewDataset, previous: Path | None

@@ -210,6 +210,12 @@ class ScenePrior(nn.Module):
         self.bevels = ClassBevels(classes)
         self.shape: ShapeModule = config.shape.build(2 * width)
 
+    @property
+    def by_class(self) -> str | None:
+        """Pattern of the names of tensors with rows by class; None if prototypes have classes."""
+        pattern = r"\.(layout\.mlp2\.(3|classes)\.(weight|bias)|bevels\.logits)$"
+        return None if self.shape.faces is None else pattern
+
     def forward(
         self, logits: Float[Tensor, "rooms logits"], with_shape: bool = True
     ) -> DecodedScenes:
@@ -286,12 +292,14 @@ class PriorConfig(RunConfig):
         logits = latents.weight.detach().cpu().clone()
         return TrainedPrior(ready_copy(prior), logits, room_ids, self, stage)
 
-    def open_views(self, views_per_room: int, mask_step: int | None) -> ViewDataset:
-        """The training rooms with their views; an `InputError` if they do not fit the config."""
+    def open_views(
+        self, views_per_room: int, mask_step: int | None, split: str = "train"
+    ) -> ViewDataset:
+        """The rooms of a split with their views; an `InputError` if they do not fit the config."""
         data = self.data
         rooms = ViewDataset(
             Path(data.shards),
-            "train",
+            split,
             views_per_room=views_per_room,
             rotations=data.rotations,
             view_fraction=data.view_fraction,

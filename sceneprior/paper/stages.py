@@ -33,9 +33,10 @@ from sceneprior.training.steps import (
     weighted_sum,
     with_cosine,
 )
+from sceneprior.training.validation import ValidatedModule
 
 
-class LatentStage(lightning.LightningModule, ABC):
+class LatentStage(ValidatedModule, ABC):
     """A stage that trains the network, and the latents: one row of logits per training room.
 
     `config` is the run's, and `stage` its section of this stage.
@@ -69,7 +70,7 @@ class LatentStage(lightning.LightningModule, ABC):
         noise = stage.latent_noise + done * (end - stage.latent_noise)
         with full_precision(self.device):
             z = space(self.latents(room_index.clamp(min=0)))
-            if not noise:
+            if not (noise and self.training):
                 return z
             return space.step(z, noise, batch_seed(self.seed, self.trainer, batch_idx))
 
@@ -132,10 +133,11 @@ class PaperStage(LatentStage):
         return True
 
     def on_before_batch_transfer(self, batch: SceneViews, dataloader_idx: int) -> SceneViews:
-        return batch if self.static is None else self.static.padded(batch)
+        static = self.static if self.training else None  # validation takes plain steps
+        return batch if static is None else static.padded(batch)
 
     def training_step(self, views: SceneViews, batch_idx: int) -> Tensor:
-        if self.static is None:
+        if self.static is None or not self.training:
             return self.eager_step(views, batch_idx)
         self._check_last()
         z = self.room_latents(views.room_index, batch_idx)

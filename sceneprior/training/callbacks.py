@@ -1,10 +1,13 @@
 """Lightning callbacks: progress, a seed for each batch, `last.ckpt` after each epoch; and SLURM: a
 job stops in time and is requeued (docs/cluster.md)."""
 
+import math
 import os
+import shutil
 import signal
 import subprocess
 import threading
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,8 +21,9 @@ from lightning.pytorch.utilities import rank_zero_only
 from rich import progress
 from rich.console import Console
 from torch import nn
+from torch.optim.lr_scheduler import OneCycleLR
 
-from sceneprior.core.errors import InputError
+from sceneprior.core.errors import InputError, InputWarning
 from sceneprior.core.files import write_whole
 from sceneprior.core.repeatable import LARGEST_SEED
 from sceneprior.training.method import read_checkpoint
@@ -82,8 +86,33 @@ class StepSeed(Callback):
             torch.manual_seed(seed)
 
 
+class Statistics(Callback):
+    """Logs, once per epoch, the learning rates (`lr/<parameter group>`), the norm of the gradients
+    in the last step before clipping, and the standard deviation of the latents' logits."""
+
+    def on_before_optimizer_step(self, trainer: lightning.Trainer, pl_module, optimizer) -> None:
+        if trainer.fit_loop.epoch_loop.batch_progress.is_last_batch:
+            norm = nn.utils.get_total_norm(
+                [
+                    parameter.grad
+                    for parameter in pl_module.parameters()
+                    if parameter.grad is not None
+                ]
+            )
+            pl_module.log("train/gradient_norm", norm, on_step=False, on_epoch=True, batch_size=1)
+
+    def on_train_epoch_end(self, trainer: lightning.Trainer, pl_module) -> None:
+        groups = [group for optimizer in trainer.optimizers for group in optimizer.param_groups]
+        said = {f"lr/{index}": float(group["lr"]) for index, group in enumerate(groups)}
+        latents = getattr(pl_module, "latents", None)
+        if latents is not None and latents.weight.numel() > 1:
+            said["train/latents_std"] = float(latents.weight.detach().std())
+        pl_module.log_dict(said)
+
+
 class RollingCheckpoint(Callback):
-    """Write `last.ckpt` after every epoch, the only point at which a run can be resumed exactly.
+    """Write `last.ckpt` after every epoch, the only point at which a run can be resumed exactly;
+    and its copy `best.ckpt` whenever `val/loss` is the least so far.
 
     An interrupted run loses the current epoch. The resumed run draws the views of that epoch again,
     and ends at the same weights as an uninterrupted run. The entries of `extra` (plain data) are
@@ -91,7 +120,10 @@ class RollingCheckpoint(Callback):
     """
 
     def __init__(self, folder: Path, extra: dict):
-        self.folder, self.extra, self.written = folder, extra, False
+        self.folder, self.extra, self.written, self.best = folder, extra, False, math.inf
+
+    def on_load_checkpoint(self, trainer, pl_module, checkpoint: dict) -> None:
+        self.best = float(checkpoint.get("best", math.inf))
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module) -> None:
         """Check what was restored: torch's fused optimizers read beyond tensors of other shapes."""
@@ -106,12 +138,29 @@ class RollingCheckpoint(Callback):
                     ):
                         path = Path(str(trainer.ckpt_path))
                         raise not_resumed(path, "its optimizer's state is of another network")
+        planned = int(trainer.estimated_stepping_batches) + 1
+        for schedule in (each.scheduler for each in trainer.lr_scheduler_configs):
+            if isinstance(schedule, OneCycleLR) and schedule.total_steps != planned:
+                for phase in schedule._schedule_phases:
+                    phase["end_step"] = (phase["end_step"] + 1) * planned / schedule.total_steps - 1
+                schedule.total_steps = planned
+                said = "the learning rates go on from where a run of that length would be"
+                said = f"The cosine schedule is stretched to the new number of epochs: {said}."
+                warnings.warn(said, InputWarning, stacklevel=1)
 
     def on_save_checkpoint(self, trainer, pl_module, checkpoint: dict) -> None:
-        checkpoint.update(self.extra)
+        checkpoint.update(self.extra, best=self.best)
+
+    def on_train_epoch_start(self, trainer: lightning.Trainer, pl_module) -> None:
+        if trainer.current_epoch + 1 == trainer.max_epochs:
+            trainer.check_val_every_n_epoch = 1
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, pl_module) -> None:
+        loss = float(trainer.callback_metrics.get("val/loss", math.inf))
+        better, self.best = loss < self.best, min(loss, self.best)
         write_checkpoint(trainer, self.folder, "last.ckpt")
+        if better:
+            copy_checkpoint(trainer, self.folder, "last.ckpt", "best.ckpt")
         self.written = True
 
 
@@ -122,6 +171,13 @@ def write_checkpoint(trainer: lightning.Trainer, folder: Path, name: str) -> Non
     else:
         trainer.save_checkpoint(folder / name)  # collective: takes part, but writes nothing
     # Other processes may be about to read it.
+    trainer.strategy.barrier()
+
+
+def copy_checkpoint(trainer: lightning.Trainer, folder: Path, name: str, copy: str) -> None:
+    """Copy a checkpoint atomically; every process calls this, and the first one writes."""
+    if trainer.is_global_zero:
+        write_whole(folder / copy, lambda path: shutil.copyfile(folder / name, path))
     trainer.strategy.barrier()
 
 

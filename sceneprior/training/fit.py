@@ -2,6 +2,7 @@
 
 import contextlib
 import logging
+import math
 import pkgutil
 import shutil
 import signal
@@ -24,15 +25,22 @@ from sceneprior.core.settings import check_settings, dump_settings, read_setting
 from sceneprior.training.callbacks import (
     RollingCheckpoint,
     RunProgress,
+    Statistics,
     StepSeed,
     check_resumable,
+    copy_checkpoint,
     first_process,
     requeue_on_signal,
     write_checkpoint,
 )
 from sceneprior.training.method import RunConfig, Stage, read_checkpoint, without_samples
+from sceneprior.training.start_from import start_from
 from sceneprior.training.steps import make_loader
 from sceneprior.training.trainer import LOGGERS, make_trainer, trainer_arguments, usage_errors
+from sceneprior.training.validation import val_loaders
+
+FREE = ("epochs", "val_every", "trainer", "callbacks", "logger")
+"""Keys that a resumed run may change."""
 
 
 def fit(
@@ -45,14 +53,12 @@ def fit(
 ) -> None:
     """Train the stages that `config.stages()` lists; config, checkpoints and logs go to `run`.
 
-    A run that is refused at its start leaves no files behind, and neither does one with Lightning's
-    `fast_dev_run`.
+    A run that is refused at its start leaves no files behind, nor does Lightning's fast_dev_run.
 
     Args:
-        resume: Continue an interrupted run, without training its finished stages again.
+        resume: Continue a run, without training its finished stages again.
         loggers: Names of `LOGGERS`.
-        trainer_options: Arguments of Lightning's Trainer (devices, precision, max_steps), which
-            replace those of the section `trainer`.
+        trainer_options: Arguments of Lightning's Trainer, before those of the section `trainer`.
         callbacks: Lightning's callbacks for every stage, called after those of `fit`.
     """
     run, config = Path(run), config.with_label_set()
@@ -68,9 +74,7 @@ def fit(
             _check_run(config, run, resume)
         for stage in config.stages():
             final = run / stage.name / "final.ckpt"
-            if final.is_file():
-                read_checkpoint(final)  # raises an error if it is damaged
-            else:
+            if not _is_finished(final, stage, config):
                 own = list(callbacks)
                 _train(stage, config, final.parent, previous, resume, loggers, arguments, own)
             previous = final
@@ -109,17 +113,45 @@ def _check_run(config: RunConfig, run: Path, resume: bool) -> None:
         )
     try:
         data = without_samples(read_settings(str(saved))[1], str(saved))
-        same = check_settings(type(config), data, str(saved)) == config
+        before = check_settings(type(config), data, str(saved))
     except ConfigError:
         raise InputError(
             f"{saved} is of another method or version than the settings given now, or damaged; "
             "name another folder."
         ) from None
-    if not same:
+    if changed := [*_changed(before.model_dump(by_alias=True), config.model_dump(by_alias=True))]:
         raise InputError(
-            f"{saved} differs from the settings given now; resume with "
+            f"{saved} differs from the settings given now in {', '.join(changed)}; resume with "
             f"`--config {saved}` or name another folder."
         )
+
+
+def _changed(before: dict[str, Any], now: dict[str, Any], within: str = "") -> Iterator[str]:
+    """Keys of the settings that differ and that a resumed run must keep."""
+    for key in before.keys() | now.keys():
+        old, new = before.get(key), now.get(key)
+        if isinstance(old, dict) and isinstance(new, dict) and within + key not in FREE:
+            yield from _changed(old, new, f"{within}{key}.")
+        elif old != new and key not in FREE:
+            yield within + key
+
+
+def _is_finished(final: Path, stage: Stage, config: RunConfig) -> bool:
+    """False if the stage has no final.ckpt, or one of fewer epochs than the settings ask for; an
+    `InputError` if it is damaged, or cannot be trained longer."""
+    if not final.is_file():
+        return False
+    saved, asked = read_checkpoint(final), stage.settings.epochs
+    done = saved.get("sceneprior", {}).get("epochs", saved.get("epoch"))
+    after = config.stage_names[config.stage_names.index(stage.name) + 1 :]
+    begun = any((final.parents[1] / name).exists() for name in after)
+    if done != asked and (done > asked or begun or not final.with_name("last.ckpt").is_file()):
+        raise InputError(
+            f"{final} was trained for {done} epochs, and the settings ask for {asked}. A stage can "
+            "be trained longer while its last.ckpt is there and no later stage has begun; else "
+            f"name another folder, and start with its weights (--init-from {final})."
+        )
+    return bool(done == asked)
 
 
 def _train(
@@ -143,10 +175,15 @@ def _train(
     latents = getattr(module, "latents", None)
     pairs_no_room = latents is not None and not len(latents.weight)  # the table is empty
     room_ids = [] if pairs_no_room else [*rooms.room_ids]
-    said = {"sceneprior": {"room_ids": room_ids, "label_set": config.label_set}}
-    rolling = RollingCheckpoint(folder, said)
+    last = folder / "last.ckpt"
+    start = last if resume and last.is_file() else None
+    if previous is None and config.init_from and start is None:
+        start_from(Path(config.init_from), module, config.label_set, room_ids)
+    said = {"room_ids": room_ids, "label_set": config.label_set, "epochs": settings.epochs}
+    rolling = RollingCheckpoint(folder, {"sceneprior": said})
     callbacks = [
-        RunProgress(f"fit {stage.name} (epochs)"), StepSeed(config.seed), rolling, *callbacks
+        RunProgress(f"fit {stage.name} (epochs)"), StepSeed(config.seed), Statistics(), rolling,
+        *callbacks,
     ]  # fmt: skip
     # Lightning's hints are silenced; GPUs that can multiply matrices fast (TF32) may do so.
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
@@ -154,9 +191,9 @@ def _train(
     warnings.filterwarnings("ignore", module="lightning")
     torch.set_float32_matmul_precision("high")
     lightning.seed_everything(config.seed, verbose=False)
-    arguments = dict(arguments)
-    if repeated := arguments.pop("overfit_batches", 0):
-        arguments["limit_train_batches"] = repeated
+    repeated = arguments.get("overfit_batches")  # Lightning's own would replace our sampler
+    if repeated:
+        arguments = arguments | {"limit_train_batches": repeated, "overfit_batches": 0.0}
     trainer = make_trainer(stage, config, folder, loggers, arguments, callbacks)
     module.save_hyperparameters({**config.model_dump(mode="json", by_alias=True), **_version()})
     # Written only now: a run that is refused leaves no files behind.
@@ -169,18 +206,16 @@ def _train(
     # With masks, worker processes may load the batches; for CUDA graphs, the host counts objects.
     if rooms.masks is None and not with_graphs:
         rooms.to(trainer.strategy.root_device)
-    loader = make_loader(
-        rooms, settings.batch_size, config.seed, config.data.workers,
-        trainer.global_rank, trainer.world_size, repeated=bool(repeated),
-    )  # fmt: skip
-    last = folder / "last.ckpt"
-    start = last if resume and last.is_file() else None
+    process = trainer.global_rank, trainer.world_size
+    loader = make_loader(rooms, settings.batch_size, config.seed, config.data.workers, *process)
+    loader.sampler.repeated = bool(repeated)  # type: ignore[attr-defined]
+    held_out = val_loaders(stage, module, rooms, Path(config.data.shards), *process)
     if start is not None:
         check_resumable(start, module)
     before = signal.getsignal(signal.SIGINT)
     try:
         with usage_errors(arguments):
-            trainer.fit(module, loader, ckpt_path=start, weights_only=True)
+            trainer.fit(module, loader, held_out, ckpt_path=start, weights_only=True)
     except SystemExit:
         # Lightning answers Ctrl-C with sys.exit(1).
         if not trainer.interrupted:
@@ -202,17 +237,18 @@ def _train(
     finally:
         if "wandb" in loggers:  # otherwise it would log the next stage to the same run
             pkgutil.resolve_name("wandb:finish")()
-    write_checkpoint(trainer, folder, "final.ckpt")
+    if settings.keep == "best" and rolling.best < math.inf:
+        copy_checkpoint(trainer, folder, "best.ckpt", "final.ckpt")
+    else:
+        write_checkpoint(trainer, folder, "final.ckpt")
 
 
 def _version() -> dict[str, str]:
-    """The package's version, and its git commit if it runs from a repository."""
-    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
-    said = {"version": sceneprior.__version__}
-    with contextlib.suppress(OSError, subprocess.CalledProcessError):
-        found = subprocess.run(command, capture_output=True, text=True, check=True)
-        said["commit"] = found.stdout.strip()
-    return said
+    """The package's version, and its git commit, which is empty outside of a repository."""
+    command, commit = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"], ""
+    with contextlib.suppress(OSError):
+        commit = subprocess.run(command, capture_output=True, text=True, check=False).stdout
+    return {"version": sceneprior.__version__, "commit": commit.strip()}
 
 
 def warn_of_losses(shards: Path, rooms: int) -> None:

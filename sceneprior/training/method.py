@@ -7,6 +7,7 @@ baselines have their own; `apps/config.py` lists all.
 
 RUN/config.yaml            all settings, defaults included
 RUN/<stage>/last.ckpt      the stage's newest checkpoint, from which `--resume` continues
+RUN/<stage>/best.ckpt      the epoch with the least val/loss
 RUN/<stage>/final.ckpt     the finished stage, which commands load
 RUN/<stage>/metrics.csv    one line per epoch; TensorBoard's files are in the same folder
 """
@@ -80,6 +81,11 @@ class TrainConfig(Section):
     cpu_threads: int | None = Field(None, ge=1)
     """Torch threads on a CPU; None is 1. A second one changes the last bits of weights, speeds up a
     small network little, and slows it down much when another program uses that core."""
+    val_every: int = Field(20, ge=0)
+    """Epochs between validations, and the last is validated, too; 0 for none."""
+    keep: Literal["last", "best"] = "last"
+    """Weights that the next stage and commands take: those of the `last` epoch, or best.ckpt, which
+    is the validated epoch with the least `val/loss`."""
 
 
 def without_samples(data: dict[str, Any], source: str) -> dict[str, Any]:
@@ -107,6 +113,8 @@ class Stage:
     `TruthDataset`."""
     build: Callable[[Any, Path | None], "lightning.LightningModule"]
     """Builds the module from these rooms and the checkpoint of the previous stage."""
+    open_val: Callable[[], Any] | None = None
+    """Opens the val rooms in the same way; None for a stage that is not validated on them."""
     steps_itself: bool = False
     """True for a module that steps its own optimisers; it trains in one process, without
     accumulation."""
@@ -122,12 +130,13 @@ class RunConfig(Section, ABC):
     set are refused."""
     seed: int = Field(0, ge=0, le=LARGEST_SEED)
     data: DataConfig
+    init_from: str | None = None
+    """Run folder or checkpoint with whose weights the first stage starts, in place of random ones;
+    another label set's classes are found by their names, and rooms' latents by their ids."""
     trainer: dict[str, Any] = Field({})
-    """Arguments of Lightning's Trainer, such as {max_steps: 1000, precision: bf16-mixed}. What the
-    sections of the stages set, such as the epochs, is set there."""
+    """Arguments of Lightning's Trainer that no section of a stage sets, such as {max_steps: 9}."""
     callbacks: tuple[dict[str, dict[str, Any] | None], ...] = Field((), strict=False)
-    """Lightning callbacks for every stage, each as {class path: arguments}, such as
-    {lightning.pytorch.callbacks.EarlyStopping: {monitor: val/loss}}."""
+    """Lightning callbacks for every stage, each as {class path: arguments}."""
     logger: dict[Literal["csv", "tensorboard", "wandb"], dict[str, Any]] = Field({})
     """Arguments of Lightning's loggers, such as {wandb: {project: rooms, tags: [small]}}."""
 

@@ -32,20 +32,15 @@ class DrawSampler(Sampler[list[tuple[int, int]]]):
     In each step, the `world` processes together draw the rows that a single process with a `world`
     times larger `batch_size` would draw; `rank` is the index of this process. If the last batch has
     fewer rows than there are processes, each process without a row gets a draw of the epoch
-    `BLANK`, for which the data set returns an empty room. If `repeated`, every epoch is the first.
+    `BLANK`, for which the data set returns an empty room.
     """
 
-    def __init__(
-        self,
-        rows: int,
-        batch_size: int,
-        seed: int,
-        rank: int = 0,
-        world: int = 1,
-        repeated: bool = False,
-    ):
+    repeated = False
+    """True if every epoch is the first."""
+
+    def __init__(self, rows: int, batch_size: int, seed: int, rank: int = 0, world: int = 1):
         self.rows, self.batch_size, self.seed = rows, batch_size, seed
-        self.rank, self.world, self.repeated = rank, world, repeated
+        self.rank, self.world = rank, world
         self.epoch = 0
         # Lightning sets the epoch of a loader's `sampler` and of its `batch_sampler.sampler`, but
         # not of the `batch_sampler`, so this batch sampler is also its own `sampler`.
@@ -75,7 +70,6 @@ def make_loader(
     workers: int,
     rank: int = 0,
     world: int = 1,
-    repeated: bool = False,
 ) -> DataLoader:
     """Make a loader of `SceneViews` (from a `ViewDataset`) or `RoomBoxes` (of true boxes).
 
@@ -84,7 +78,7 @@ def make_loader(
     pass batches, is too small.
     """
     workers = 0 if dataset.masks is None else workers
-    sampler = DrawSampler(len(dataset), batch_size, seed, rank, world, repeated)
+    sampler = DrawSampler(len(dataset), batch_size, seed, rank, world)
     if workers and _overfill_shared_memory(dataset.__getitems__(next(iter(sampler))), workers):
         workers = 0
     return DataLoader(
@@ -100,18 +94,13 @@ def make_loader(
 
 def _overfill_shared_memory(batch: Any, workers: int) -> bool:
     """True, with a warning, if the batches that workers prefetch do not fit into /dev/shm."""
-    shared = Path("/dev/shm")
     each = sum(value.nbytes for value in vars(batch).values() if isinstance(value, Tensor))
     needed = (2 * workers + 1) * each  # torch's prefetch factor is 2
-    free = shutil.disk_usage(shared).free if shared.is_dir() else needed
+    free = shutil.disk_usage("/dev/shm").free if Path("/dev/shm").is_dir() else needed
     if needed > free:
-        warnings.warn(
-            f"{workers} workers need {needed / 2**20:.0f} MB of shared memory, but {shared} has "
-            f"{free / 2**20:.0f} MB left, so batches are read without workers; enlarge it (docker "
-            "run --shm-size 2g), or set data.workers to 0.",
-            InputWarning,
-            stacklevel=3,
-        )
+        said = f"need {needed / 2**20:.0f} MB of shared memory, and /dev/shm has {free / 2**20:.0f}"
+        then = "enlarge it (docker run --shm-size 2g), or set data.workers to 0"
+        warnings.warn(f"{workers} workers {said}, so none are used; {then}.", InputWarning, 3)
     return needed > free
 
 
@@ -168,22 +157,27 @@ def batch_seed(seed: int, trainer: "lightning.Trainer", batch_idx: int) -> int:
 def log_losses(
     module: "lightning.LightningModule", values: dict[str, Tensor], total: Tensor, rooms: int
 ) -> None:
-    """Log means over an epoch and all processes, as `train/<name>`, and `total` as `train/loss`.
+    """Log means over an epoch and all processes, as `train/<name>` and `train/loss`; in evaluation
+    mode as `val/*`, or in the group `module.log_as`, which is empty for no log.
 
-    They are summed here, and given to Lightning in the last step of an epoch: a call of its `log`
-    takes a millisecond, and a step on a GPU ten.
+    In training, they are summed here, and given to Lightning in the last step of an epoch: a call
+    of its `log` takes a millisecond, and a step on a GPU ten.
     """
+    values = values | {"loss": total}
+    how = {"on_step": False, "on_epoch": True, "sync_dist": True, "add_dataloader_idx": False}
+    if not module.training:
+        group = getattr(module, "log_as", "val")
+        named = {f"{group}/{name}": value for name, value in values.items() if group}
+        module.log_dict(named, batch_size=rooms, **how)
+        return
     trainer = module.trainer
     sums: dict[str, tuple[Tensor | float, int]] = module.__dict__.setdefault("epoch_sums", {})
-    for name, value in (values | {"loss": total}).items():
+    for name, value in values.items():
         summed, number = sums.get(name, (0.0, 0))
         sums[name] = summed + value.detach() * rooms, number + rooms
     if trainer.is_last_batch or 0 < trainer.max_steps <= trainer.global_step + 1:
         for name, (summed, number) in sums.items():
-            module.log(
-                f"train/{name}", summed / number, on_step=False, on_epoch=True, batch_size=number,
-                sync_dist=True,
-            )  # fmt: skip
+            module.log(f"train/{name}", summed / number, batch_size=number, **how)
         sums.clear()
 
 

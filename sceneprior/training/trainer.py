@@ -30,11 +30,13 @@ ELSEWHERE = {
     "max_epochs": "set `epochs` in the section of the stage",
     "gradient_clip_val": "set `clip_gradient` in the section of the stage",
     "accumulate_grad_batches": "set `accumulate` in the section of the stage",
+    "check_val_every_n_epoch": "set `val_every` in the section of the stage",
     "callbacks": "use the section `callbacks`",
     "logger": "use the section `logger` and `--logger`",
     "default_root_dir": "use `--run`",
     "enable_checkpointing": "`fit` writes the checkpoints itself",
     "use_distributed_sampler": "`fit` divides the rooms among processes itself",
+    "inference_mode": "latents of val rooms need gradients",
     "plugins": "`fit` sets those of SLURM itself",
 }
 """Arguments of the Trainer that `fit` sets itself, and where they are set instead."""
@@ -43,25 +45,16 @@ PRECISIONS = ("32-true", "bf16-mixed", "64-true", "bf16-true", "32", "64", "bf16
 
 
 def trainer_arguments(config: RunConfig, options: dict[str, Any]) -> dict[str, Any]:
-    """Arguments of Lightning's Trainer from `options` and the run's section `trainer`; where both
-    set one, `options` win.
-
-    Raises:
-        ConfigError: an argument that the Trainer does not have, or a precision that no stage
-            supports.
-    """
+    """Arguments of Lightning's Trainer from the run's section `trainer` and, with precedence,
+    `options`; a `ConfigError` if the Trainer or a stage does not support one."""
     given = config.trainer | {name: value for name, value in options.items() if value is not None}
     known = inspect.signature(lightning.Trainer).parameters
     for name in given:
         if name not in known:
             near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)[0]
-            raise ConfigError(
-                f"Lightning's Trainer has no argument '{name}' (trainer.{name}); the nearest is "
-                f"'{near}'."
-            )
+            raise ConfigError(f"trainer.{name} is no argument of Lightning's; is '{near}' meant?")
         if name in ELSEWHERE:
-            said = f"trainer.{name} is left out: {ELSEWHERE[name]}."
-            warnings.warn(said, InputWarning, stacklevel=2)
+            warnings.warn(f"trainer.{name} is left out: {ELSEWHERE[name]}.", InputWarning, 2)
     if given.get("precision", "32-true") not in PRECISIONS:
         raise ConfigError(
             f"precision is '{given['precision']}', which is not supported: its gradients are "
@@ -78,25 +71,25 @@ def make_trainer(
     arguments: dict[str, Any],
     callbacks: list[Callback],
 ) -> lightning.Trainer:
-    """The Trainer of a stage whose files go to `folder`; `arguments` are those of
-    `trainer_arguments`, without `overfit_batches`."""
+    """The Trainer of a stage whose files go to `folder`, with `trainer_arguments`."""
     settings = stage.settings
+    free = {"enable_progress_bar": False, "enable_model_summary": False, "num_sanity_val_steps": 0}
     ours: dict[str, Any] = {
         "max_epochs": settings.epochs,
+        "check_val_every_n_epoch": settings.val_every or 1,
+        "inference_mode": False,
         "callbacks": [*callbacks, *configured_callbacks(config)],
         "plugins": slurm_plugins(),
         "default_root_dir": folder,
         "enable_checkpointing": False,
         "use_distributed_sampler": False,
+        "logger": False,
     }
     if not stage.steps_itself:
         ours["gradient_clip_val"] = settings.clip_gradient or None
         ours["accumulate_grad_batches"] = settings.accumulate
-    defaults = dict.fromkeys(("enable_progress_bar", "enable_model_summary"), False)
     with usage_errors(arguments, ValueError, TypeError, RuntimeError):
-        trainer = lightning.Trainer(
-            **defaults | {"log_every_n_steps": 1} | arguments | ours | {"logger": False}
-        )
+        trainer = lightning.Trainer(**free | {"log_every_n_steps": 1} | arguments | ours)
     tasks = os.environ.get("SLURM_NTASKS_PER_NODE", str(trainer.num_devices))
     if SLURMEnvironment.detect() and tasks != str(trainer.num_devices):
         raise InputError(
@@ -156,19 +149,16 @@ def configured_callbacks(config: RunConfig) -> list[Callback]:
 
 def make_logger(name: str, folder: Path, given: dict[str, Any] | None = None) -> Logger:
     """Make a logger for a stage's folder; `name` is one of `LOGGERS`, and `given` are arguments of
-    Lightning's class, which replace those chosen here.
-
-    The CSV logger appends to the file of an interrupted run.
-    """
+    Lightning's class. The CSV logger appends to the file of an interrupted run."""
     given = given or {}
+    plain: dict[str, Any] = {"name": "", "version": ""}
     try:
         if name == "tensorboard":
-            tensorboard: dict[str, Any] = {"name": "", "version": "", "default_hp_metric": False}
-            return TensorBoardLogger(folder, **(tensorboard | given))
+            return TensorBoardLogger(folder, **plain | {"default_hp_metric": False} | given)
         if name == "csv":
             # Lightning's CSVLogger deletes an existing file, so it is given its earlier rows.
             before = read_metrics(folder / "metrics.csv")
-            logger = CSVLogger(folder, **{"name": "", "version": ""} | given)
+            logger = CSVLogger(folder, **plain | given)
             if before and first_process():
                 logger.experiment.metrics.extend(before)
                 logger.save()

@@ -29,6 +29,9 @@ def fit(
         list[str] | None, option("Changed key: model.width=256; repeatable.", "--set")
     ] = None,
     resume: Annotated[bool, option("Continue a stopped run.", "--resume")] = False,
+    init_from: Annotated[
+        Path | None, option("Run or checkpoint whose weights training starts with.")
+    ] = None,
     logger: Annotated[
         list[str] | None, option("Logger: csv, tensorboard or wandb; repeatable.")
     ] = None,
@@ -41,7 +44,8 @@ def fit(
     """Train the stages of a run, one after the other."""
     from sceneprior.apps.config import load_config
 
-    settings = load_config(config, tuple(set_ or ()))  # before imports that take seconds
+    changed = [*(set_ or ()), *([f"init_from={init_from}"] if init_from else ())]
+    settings = load_config(config, tuple(changed))  # before imports that take seconds
     folder = run or Path("runs") / Path(config).stem
     from sceneprior.training.fit import fit as run_fit
 

@@ -10,7 +10,7 @@ import torch
 
 from sceneprior.apps.api import load
 from sceneprior.core.classes import label_set
-from sceneprior.core.dataset import ViewDataset, allowed_views
+from sceneprior.core.dataset import ViewDataset
 from sceneprior.core.errors import InputError
 from sceneprior.core.ground_truth import known_in_3d, reference_scenes
 from sceneprior.core.scene import Scene, SceneObject
@@ -177,12 +177,11 @@ def mask_scores(trained: TrainedPrior, shards: Path) -> dict[str, float]:
     if not isinstance(config, PaperConfig) or trained.stage == "layout":
         return {}
     data = config.data
-    fewest = min(len(shard.read_room(r).visible) for shard, r in iterate_rooms(shards, "train"))
-    held_out = len(allowed_views(0, 0, fewest, data.view_fraction)) < fewest
-    rooms = ViewDataset(
+    training = ViewDataset(
         shards, "train", views_per_room=VIEWS, rotations=data.rotations, seed=config.seed,
-        mask_step=data.mask_step, view_fraction=data.view_fraction, held_out=held_out,
+        mask_step=data.mask_step, view_fraction=data.view_fraction,
     )  # fmt: skip
+    rooms = training.for_validation()
     if set(rooms.room_ids) != set(trained.room_ids):
         raise InputError(
             f"{shards} does not hold the training rooms of this run; give the shards it was "
@@ -196,7 +195,7 @@ def mask_scores(trained: TrainedPrior, shards: Path) -> dict[str, float]:
         found = view_loss(trained, decode_images(trained, points, views), views)
         seen = views.visible.sum(dim=(1, 2))
         total, pairs = total + float((found.mask_iou * seen).sum()), pairs + int(seen.sum())
-    key = "mask_iou_held_out" if held_out else "mask_iou_training_views"
+    key = "mask_iou_training_views" if rooms is training else "mask_iou_held_out"
     return {key: total / pairs} if pairs else {}
 
 

@@ -105,7 +105,7 @@ def pack(trained: Trained, card: str, latents: bool = False, half: bool = False)
 def shared_settings(config: RunConfig) -> dict[str, Any]:
     """A run's settings, without those of Lightning, and with the shards' path reduced to a name, to
     hide the user's folders."""
-    ours = {"trainer", "callbacks", "logger"}
+    ours = {"trainer", "callbacks", "logger", "init_from"}
     settings = config.model_dump(mode="json", by_alias=True, exclude=ours)
     settings["data"]["shards"] = Path(settings["data"]["shards"]).name
     return settings

@@ -232,10 +232,10 @@ class SingleViewConfig(OneStageConfig):
             )
         return self
 
-    def open_rooms(self) -> Any:
+    def open_rooms(self, split: str = "train") -> Any:
         data = self.data
         rooms = self.dataset(
-            Path(data.shards), "train", views_per_room=data.views_per_room,
+            Path(data.shards), split, views_per_room=data.views_per_room,
             view_fraction=data.view_fraction, mask_step=data.mask_step, seed=self.seed,
         )  # fmt: skip
         self.check_rooms(rooms, None)

@@ -80,16 +80,13 @@ class SamplerStage(lightning.LightningModule):
         log_losses(self, means, total, len(rooms.boxes_m))
         return total
 
-    def on_train_batch_end(self, outputs: Any, batch: PosedRooms, batch_idx: int) -> None:
-        """Every few epochs, keep the network if the val rooms' likelihood is the highest so far.
+    def val_dataloader(self) -> list[list[int]]:
+        """A loader with a single batch, which stands for all val rooms."""
+        return [[0]]
 
-        This runs after the last batch of the epoch, because the epoch's checkpoint is written
-        before Lightning ends the epoch.
-        """
-        done = self.current_epoch + 1
-        looks = done % self.stage.val_every == 0 or done == self.stage.epochs
-        if batch_idx + 1 < self.trainer.num_training_batches or not looks:
-            return
+    def validation_step(self, batch: Any, batch_idx: int) -> None:
+        """Keep the network if the val rooms' likelihood is the highest so far, or without val
+        rooms."""
         if self.val is not None:
             found = self.val_loss()
             self.log("val/loss", found, on_step=False, on_epoch=True, batch_size=1)
@@ -98,6 +95,10 @@ class SamplerStage(lightning.LightningModule):
             self.least.copy_(found)
         self.sampler.load_state_dict(self.learner.state_dict())
 
+    def on_train_end(self) -> None:
+        if self.least.isinf():  # stopped before the first validation, or there are no val rooms
+            self.sampler.load_state_dict(self.learner.state_dict())
+
     @torch.no_grad()
     def val_loss(self) -> Tensor:
         """Mean negative log-likelihood of the val rooms over `ORDERS` orders, which are the same in
@@ -105,12 +106,10 @@ class SamplerStage(lightning.LightningModule):
         assert self.val is not None
         rooms = self.val.to(self.device).rooms
         generator = torch.Generator().manual_seed(self.seed)
-        self.learner.eval()
         plain = torch.zeros_like(rooms.object_class[:, 0])
         found = [
             negative_log_likelihood(self.learner, rooms, plain, generator) for _ in range(ORDERS)
         ]
-        self.learner.train()
         return (
             torch.stack([part.mean() for parts in found for part in parts.values()]).sum() / ORDERS
         )
