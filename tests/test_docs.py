@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from golden_values import TAKE
 from pages import PAGES, ROOT, Block, blocks_of, commands_of, name_of
 from typer.main import get_command
 
@@ -34,7 +35,7 @@ BASES = [
     ROOT / name for name in ("", "sceneprior", "docs", "configs", "benchmarks", "data_prep/engine")
 ]
 """Folders to which paths in pages are relative."""
-MADE_BY_USERS = {"config.yaml"}
+MADE_BY_USERS = {"config.yaml", "hparams.yaml"}
 """Names of YAML files that are no part of the repository."""
 
 
@@ -187,6 +188,13 @@ def test_every_command_is_in_the_reference():
 
 PATH = re.compile(r"`([\w./-]+(?:\.py|\.yaml|\.csv|/))`")
 """A file or a folder of ours in the text of a page."""
+
+
+def test_the_page_of_settings_is_what_its_script_makes():
+    made = runpy.run_path(str(ROOT / "docs/write_configuration.py"))["page"]()
+    if TAKE:
+        (ROOT / "docs/configuration.md").write_text(made)
+    assert made == (ROOT / "docs/configuration.md").read_text()
 
 
 def find(path: str) -> Path | None:

@@ -52,11 +52,13 @@ class EncoderConfig(Section):
     """Size of the encoder of ATISS and of ATISS-2D; the defaults are the published settings."""
 
     layers: int = Field(4, ge=1, le=100)
+    """Layers of the transformer encoder; more need more rooms."""
     heads: int = Field(8, ge=1)
     """Attention heads; must divide the width."""
     hidden: int = Field(1024, ge=8)
     """Inner width of the feed-forward layers."""
     dropout: float = Field(0.1, ge=0, lt=1)
+    """Share of activations dropped in training; more delays overfitting."""
 
     def build_layers(self, width: int, norm_first: bool = False) -> nn.ModuleList:
         """Freshly initialised layers, each with its own weights. `nn.TransformerEncoder` would

@@ -74,6 +74,7 @@ class GanTraining(TrainConfig):
     accumulate: Literal[1] = 1
     """Every batch updates both networks."""
     views_per_room: int = Field(4, ge=1)
+    """Views of each real and generated room per step."""
     learning_rate: float = Field(1e-3, gt=0)
     """Learning rate of the generator, whose shape decoder learns at a tenth of it."""
     discriminator_learning_rate: float = Field(4e-3, gt=0)
@@ -93,7 +94,7 @@ class GanTraining(TrainConfig):
     clip_gradient: float = Field(1.0, ge=0)
     """Maximum gradient norm of each network; 0 turns clipping off."""
     silhouettes: Literal["exact", "fast"] = "fast"
-    """See `ShapeConfig`."""
+    """`exact`: every face near a pixel counts; `fast`: the outline alone, in less time."""
 
 
 class GanModel(ModelConfig):

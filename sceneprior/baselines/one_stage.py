@@ -35,6 +35,7 @@ class OneStageTraining(TrainConfig):
     """Settings of one network's training."""
 
     learning_rate: float = Field(gt=0)
+    """Learning rate of Adam, before the schedule."""
     schedule: Literal["constant", "cosine"] = "constant"
     """`constant` keeps the rate; with `cosine`, it rises briefly and then falls to 0."""
 

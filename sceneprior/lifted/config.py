@@ -39,8 +39,12 @@ class LiftedLossConfig(Section):
     """Weights of the losses against lifted boxes and shapes."""
 
     class_: float = Field(1.0, ge=0, alias="class")
+    """lambda_l of Eq. 7."""
     box: float = Field(5.0, ge=0)
+    """lambda_box of Eq. 7, for the distance of 3D boxes; a larger value trades classes for
+    positions."""
     completeness: float = Field(1.0, ge=0)
+    """lambda_p of Eq. 7, the weight of the number of objects."""
     shape: float = Field(2.0, ge=0)
     """Weight of the distance between decoded and lifted shapes."""
     latents: float = Field(0.0, ge=0)
@@ -48,7 +52,7 @@ class LiftedLossConfig(Section):
     from which the logits of new rooms are sampled; with it, a larger part of the sphere decodes
     into rooms."""
     match_box: float = Field(5.0, ge=0)
-    """lambda_B of the matching cost."""
+    """lambda_B of the matching cost: larger values match by position more than by class."""
 
 
 class LiftedStageConfig(LatentStageConfig):

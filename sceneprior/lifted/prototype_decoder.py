@@ -45,15 +45,18 @@ class PrototypeConfig(ShapeModuleConfig):
     """Shapes in parts, chosen among prototypes lifted from the training rooms' masks."""
 
     prototypes: int = Field(1024, ge=1)
-    """Maximum number of prototype shapes, which represent the shapes of all objects."""
+    """Maximum number of prototype shapes, which represent the shapes of all objects. Fewer are
+    coarser, and more often repeated."""
     codes: int = Field(128, ge=1)
-    """Dimension of the shape code; similar looks (`lifted/prototypes.py`) have nearby codes."""
+    """Dimension of the shape code; similar looks (`lifted/prototypes.py`) have nearby codes. A
+    larger one tells more looks apart."""
     width: int = Field(128, ge=8)
     """Hidden width of the MLP that predicts the code."""
     cells: int = Field(32, ge=8, le=64)
-    """Cells along each axis of the grids on which visual hulls are carved and looks compared."""
+    """Cells along each axis of the grids on which visual hulls are carved and looks compared. More
+    are finer; lifting's time and memory grow with their cube."""
     margin: float = Field(1.1, ge=1, le=2)
-    """Extent of these grids, relative to the object's box."""
+    """Extent of these grids, relative to the object's box; at 1, hulls are cut off at the box."""
 
     def build(self, features: int) -> "PrototypeDecoder":
         """The module for object features of width `features`, freshly initialised."""

@@ -242,9 +242,10 @@ class ShapeDecoderConfig(ShapeModuleConfig):
     """Template and size of the shape decoder."""
 
     width: int = Field(256, ge=8)
-    """Hidden width; the paper's network has 256."""
+    """Hidden width; the paper's network has 256. Wider ones deform in more detail, slower."""
     level: int = Field(4, ge=0, le=6)
-    """Icosphere subdivisions of the template: 20 * 4**level faces."""
+    """Icosphere subdivisions of the template: 20 * 4**level faces. Each level has finer shapes, and
+    four times the faces to render."""
     template: Literal["sphere", "box"] = "sphere"
     """Mesh that is deformed: the `sphere` (paper), or the same mesh with its vertices moved out to
     the surface of the object's `box`."""

@@ -33,8 +33,8 @@ class SphereConfig(Section):
 
     name: Literal["sphere"] = "sphere"
     anchors: int = Field(100, ge=2)
-    """M, the number of fixed unit vectors of which latents are mixtures; 100 in the authors'
-    code."""
+    """M, the number of fixed unit vectors of which latents are mixtures; 100 in the authors' code.
+    Fewer make new rooms better, and training rooms less exact."""
 
     def build(self, dimension: int, seed: int) -> "LatentSphere":
         return LatentSphere(self.anchors, dimension, seed)
@@ -159,9 +159,10 @@ class ModelConfig(Section):
     """The network (section 3 and supplement A). `apps/config.py` lists the choices of `decoder`."""
 
     max_objects: int = Field(ge=1, le=1000)
-    """N, the number of predictions: 13 for bedrooms, 28 for living rooms, 53 for ScanNet."""
+    """N, the number of predictions: 13 for bedrooms, 28 for living rooms, 53 for ScanNet. Rooms
+    with more objects are refused."""
     width: int = Field(512, ge=8)
-    """D_z, the dimension of latents and object features."""
+    """D_z, the dimension of latents and object features. Wider networks fit more rooms, slower."""
     latent_space: Annotated[SphereConfig | CubeConfig, Field(discriminator="name")] = SphereConfig()
     decoder: DecoderConfig
     layout_heads: Literal["joint", "separate"] = "joint"

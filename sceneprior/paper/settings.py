@@ -12,23 +12,25 @@ class LossConfig(Section):
     """Weights of the losses (lambda_l, lambda_box, ...) and settings of matching (section 4)."""
 
     class_: float = Field(1.0, ge=0, alias="class")
-    """lambda_l of Eq. 7."""
+    """lambda_l of Eq. 7, the weight of classes. Only ratios of the weights change the result."""
     box: float = Field(5.0, ge=0)
-    """lambda_box of Eq. 7."""
+    """lambda_box of Eq. 7, the weight of 2D boxes."""
     completeness: float = Field(1.0, ge=0)
-    """lambda_p of Eq. 7."""
+    """lambda_p of Eq. 7, the weight of the number of objects."""
     frustum: float = Field(1.0, ge=0)
-    """lambda_f of Eq. 7."""
+    """lambda_f of Eq. 7, the weight that moves matched objects into the view."""
     mask: float = Field(2.0, ge=0)
     """lambda_S, the weight of the shape loss (Eq. 8)."""
     match_box: float = Field(5.0, ge=0)
-    """lambda_B of the matching cost (Eq. S2)."""
+    """lambda_B of the matching cost (Eq. S2): larger values match by position more than by
+    class."""
     occlusion_slack: float = Field(1.0, ge=0, le=1)
     """Weight of the distance by which a predicted 2D box extends beyond the observed box at a side
     where another object touches the mask and may occlude the rest. 1 (the paper) trusts every side;
     at 0, objects may extend behind others without limit."""
     iou_gate: float = Field(0.5, ge=0, lt=1)
-    """Masks enter L_S (Eq. 8) only if their IoU with the observed mask is above this value."""
+    """Masks enter L_S (Eq. 8) only if their IoU with the observed mask is above this value. At 0,
+    all that overlap do, wrong matches included."""
     passing_masks_only: bool = False
     """Average L_S over the pairs of masks that pass the gate, as in the released code. If false,
     the others count as 0 (Eq. 8). It has no effect when rooms are fitted to images."""
@@ -38,7 +40,8 @@ class LatentStageConfig(TrainConfig):
     """Settings of a stage that trains the network together with one latent per training room."""
 
     learning_rate: float = Field(1e-4, gt=0)
-    """Learning rate of the network."""
+    """Learning rate of the network. If it is too large, the loss jumps or is not finite; if too
+    small, the stage needs more epochs."""
     latent_learning_rate: float = Field(1e-4, gt=0)
     """Learning rate of the latent logits, which get one gradient per epoch, and of the bevels of
     `beveled_box`; the paper uses one rate for everything."""
@@ -61,6 +64,7 @@ class Steps(Section):
     milestones: tuple[int, ...] = Field((300,), strict=False)
     """Epochs after which the rates fall."""
     decay: float = Field(0.1, gt=0, le=1)
+    """Factor of the rates at each milestone; 1 keeps them constant."""
 
 
 class Cosine(Section):
@@ -102,11 +106,13 @@ class ShapeConfig(StageConfig):
     """Learning rate of the shape decoder, which is untrained when this stage begins, unlike the
     rest of the network; None uses `learning_rate`."""
     views_per_room: int | None = Field(None, ge=1)
-    """Views sampled per room and step; None uses `data.views_per_room`."""
+    """Views sampled per room and step, each of which is rendered; None uses
+    `data.views_per_room`."""
     sigma_px2: float | None = Field(None, gt=0)
-    """Softness of silhouettes in squared pixels; None uses the paper's 1e-4 squared NDC."""
+    """Softness of silhouettes in squared pixels; None uses the paper's 1e-4 squared NDC. Smaller is
+    crisper, and pulls on fewer pixels."""
     silhouettes: Literal["exact", "fast"] = "exact"
-    """`exact`: every face near a pixel counts (paper); `fast`: the outline alone."""
+    """`exact`: every face near a pixel counts (paper); `fast`: the outline alone, in less time."""
     compositing: Literal["layered", "paper"] = "paper"
     """Visible masks of overlapping objects. `paper`: the scene's coverage goes to the front-most
     object of each pixel; `layered`: a boundary between two objects also moves the one in front."""

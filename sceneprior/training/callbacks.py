@@ -1,21 +1,23 @@
-"""Lightning callbacks: progress, a seed for each batch, `last.ckpt` after each epoch; and SLURM: a
-job stops in time and is requeued (docs/cluster.md)."""
+"""Lightning callbacks: progress, a seed for each batch, statistics, pictures, `last.ckpt` after
+each epoch; and SLURM: a job stops in time and is requeued (docs/cluster.md)."""
 
+import contextlib
 import math
 import os
 import shutil
 import signal
 import subprocess
 import threading
+import time
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import lightning
 import torch
 from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.plugins.environments import SLURMEnvironment
 from lightning.pytorch.utilities import rank_zero_only
 from rich import progress
@@ -26,11 +28,17 @@ from torch.optim.lr_scheduler import OneCycleLR
 from sceneprior.core.errors import InputError, InputWarning
 from sceneprior.core.files import write_whole
 from sceneprior.core.repeatable import LARGEST_SEED
-from sceneprior.training.method import read_checkpoint
+from sceneprior.render.appearance import contact_sheet
+from sceneprior.render.topdown import floor_plan
+from sceneprior.training.method import RunConfig, Stage, read_checkpoint
 from sceneprior.training.steps import batch_seed
 
 _RESUMED = ("epoch", "global_step", "loops", "optimizer_states", "pytorch-lightning_version")
 """Keys of a checkpoint that the trainer needs to resume, in addition to the weights."""
+PICTURED = 4
+"""Number of rooms in a picture."""
+DRAWING = 0.02
+"""Share of a stage's time beyond which no more pictures are drawn before its end."""
 
 
 class RunProgress(Callback):
@@ -92,22 +100,54 @@ class Statistics(Callback):
 
     def on_before_optimizer_step(self, trainer: lightning.Trainer, pl_module, optimizer) -> None:
         if trainer.fit_loop.epoch_loop.batch_progress.is_last_batch:
-            norm = nn.utils.get_total_norm(
-                [
-                    parameter.grad
-                    for parameter in pl_module.parameters()
-                    if parameter.grad is not None
-                ]
-            )
+            gradients = [each.grad for each in pl_module.parameters() if each.grad is not None]
+            norm = nn.utils.get_total_norm(gradients)
             pl_module.log("train/gradient_norm", norm, on_step=False, on_epoch=True, batch_size=1)
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, pl_module) -> None:
         groups = [group for optimizer in trainer.optimizers for group in optimizer.param_groups]
         said = {f"lr/{index}": float(group["lr"]) for index, group in enumerate(groups)}
         latents = getattr(pl_module, "latents", None)
-        if latents is not None and latents.weight.numel() > 1:
+        if latents is not None and latents.weight.requires_grad and latents.weight.numel() > 1:
             said["train/latents_std"] = float(latents.weight.detach().std())
         pl_module.log_dict(said)
+
+
+class Pictures(Callback):
+    """Draws floor plans of a few rooms for TensorBoard and W&B, every `val_every` epochs within
+    `DRAWING`, and at the end. The stage's module makes the rooms (`examples`)."""
+
+    def __init__(self, config: RunConfig, stage: Stage, room_ids: Sequence[str]):
+        self.config, self.stage, self.room_ids = config, stage, tuple(room_ids)
+        self.started_s, self.spent_s, self.drawn_at = time.monotonic(), 0.0, -1
+
+    def on_train_epoch_end(self, trainer: lightning.Trainer, pl_module) -> None:
+        every, since_s = self.stage.settings.val_every, time.monotonic() - self.started_s
+        if every and (trainer.current_epoch + 1) % every == 0 and self.spent_s <= DRAWING * since_s:
+            self.draw(trainer, pl_module)
+
+    def on_train_end(self, trainer: lightning.Trainer, pl_module) -> None:
+        if self.stage.settings.val_every and self.drawn_at < trainer.global_step:
+            self.draw(trainer, pl_module)
+
+    def draw(self, trainer: lightning.Trainer, pl_module) -> None:
+        """Log a picture of each group of rooms."""
+        boards = [each for each in trainer.loggers if isinstance(each, TensorBoardLogger)]
+        others: list[Any] = [each for each in trainer.loggers if hasattr(each, "log_image")]
+        make = getattr(pl_module, "examples", None)
+        if make is None or not (trainer.is_global_zero and (boards or others)):
+            return
+        start_s, self.drawn_at = time.monotonic(), trainer.global_step
+        trained = self.config.trained(pl_module, self.stage.name, self.room_ids)
+        with contextlib.suppress(InputError):  # a network of few epochs may draw no valid room
+            for name, scenes in make(trained, PICTURED).items():
+                picture = contact_sheet([floor_plan(scene) for scene in scenes], 2)
+                key, step = f"rooms/{name}", trainer.global_step
+                for board in boards:
+                    board.experiment.add_image(key, picture, step, dataformats="HWC")
+                for other in others:
+                    other.log_image(key, [picture], step)
+        self.spent_s += time.monotonic() - start_s
 
 
 class RollingCheckpoint(Callback):
@@ -223,7 +263,7 @@ def slurm_plugins() -> list[Any]:
     return [SLURMEnvironment(auto_requeue=False)] if SLURMEnvironment.detect() else []
 
 
-@contextmanager
+@contextlib.contextmanager
 def requeue_on_signal() -> Iterator[None]:
     """In a SLURM job, handle SIGUSR1 by requeueing the job and stopping as Ctrl-C does.
 

@@ -23,6 +23,7 @@ from sceneprior.core.errors import ConfigError, InputError, InputWarning, cause_
 from sceneprior.core.files import only_writer, read_json, remove_parts
 from sceneprior.core.settings import check_settings, dump_settings, read_settings
 from sceneprior.training.callbacks import (
+    Pictures,
     RollingCheckpoint,
     RunProgress,
     Statistics,
@@ -45,7 +46,7 @@ FREE = ("epochs", "val_every", "trainer", "callbacks", "logger")
 
 def fit(
     config: RunConfig,
-    run: Path,
+    run: Path | str,
     resume: bool = False,
     loggers: tuple[str, ...] = ("csv", "tensorboard"),
     trainer_options: dict[str, Any] | None = None,
@@ -182,8 +183,8 @@ def _train(
     said = {"room_ids": room_ids, "label_set": config.label_set, "epochs": settings.epochs}
     rolling = RollingCheckpoint(folder, {"sceneprior": said})
     callbacks = [
-        RunProgress(f"fit {stage.name} (epochs)"), StepSeed(config.seed), Statistics(), rolling,
-        *callbacks,
+        RunProgress(f"fit {stage.name} (epochs)"), StepSeed(config.seed), Statistics(),
+        Pictures(config, stage, room_ids), rolling, *callbacks,
     ]  # fmt: skip
     # Lightning's hints are silenced; GPUs that can multiply matrices fast (TF32) may do so.
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
@@ -207,8 +208,9 @@ def _train(
     if rooms.masks is None and not with_graphs:
         rooms.to(trainer.strategy.root_device)
     process = trainer.global_rank, trainer.world_size
-    loader = make_loader(rooms, settings.batch_size, config.seed, config.data.workers, *process)
-    loader.sampler.repeated = bool(repeated)  # type: ignore[attr-defined]
+    loader = make_loader(
+        rooms, settings.batch_size, config.seed, config.data.workers, *process, bool(repeated)
+    )
     held_out = val_loaders(stage, module, rooms, Path(config.data.shards), *process)
     if start is not None:
         check_resumable(start, module)

@@ -47,11 +47,13 @@ class DataConfig(Section):
     shards: str
     """Folder of view shards (any `prep-*` command); relative to the current folder."""
     view_fraction: float = Field(1.0, gt=0, le=1)
-    """Share of each room's views that training may use (the paper's Table 4: 0.25, 0.5, 1)."""
+    """Share of each room's views that training may use (the paper's Table 4: 0.25, 0.5, 1);
+    validation takes the others."""
     augment_rotations: bool = True
     """Add each room rotated by 90, 180 and 270 degrees, each with its own latent."""
     mask_step: int = Field(4, ge=1)
-    """Masks are compared at 1 / mask_step of the rendered resolution (paper: 4)."""
+    """Masks are compared at 1 / mask_step of the rendered resolution (paper: 4). A larger step is
+    faster, and loses thin objects."""
     workers: int = Field(0, ge=0)
     """Loader processes; 0 loads in the training process, which is fastest for small sets."""
 
@@ -65,19 +67,21 @@ class ViewDataConfig(DataConfig):
     """The shards, and the number of views of each room that a step uses."""
 
     views_per_room: int = Field(20, ge=1)
-    """Views drawn per room and step (paper: 20), unless a stage overrides it."""
+    """Views drawn per room and step (paper: 20), unless a stage overrides it. More give smoother
+    gradients; a step's time and memory grow with them."""
 
 
 class TrainConfig(Section):
     """Training settings that the stages of all methods share. The optimiser is Adam."""
 
     epochs: int = Field(ge=1)
+    """Passes over the training rooms; `--resume` accepts a larger number (docs/training.md)."""
     batch_size: int = Field(16, ge=1)
-    """Rooms per batch and process."""
+    """Rooms per batch and process. A larger batch gives fewer, smoother updates per epoch."""
     accumulate: int = Field(1, ge=1)
-    """Batches whose gradients are averaged before each update."""
+    """Batches whose gradients are averaged before each update: larger batches without memory."""
     clip_gradient: float = Field(0.0, ge=0)
-    """Norm to which gradients are clipped; 0 turns clipping off."""
+    """Norm to which gradients are clipped, against jumps of the loss; 0 turns clipping off."""
     cpu_threads: int | None = Field(None, ge=1)
     """Torch threads on a CPU; None is 1. A second one changes the last bits of weights, speeds up a
     small network little, and slows it down much when another program uses that core."""
@@ -129,6 +133,7 @@ class RunConfig(Section, ABC):
     `core/classes.py`, or the user's own list, such as `void,bed,chair`; shards with another label
     set are refused."""
     seed: int = Field(0, ge=0, le=LARGEST_SEED)
+    """Seed of initial weights and latents, of batches, views, noise and dropout."""
     data: DataConfig
     init_from: str | None = None
     """Run folder or checkpoint with whose weights the first stage starts, in place of random ones;

@@ -32,15 +32,20 @@ class DrawSampler(Sampler[list[tuple[int, int]]]):
     In each step, the `world` processes together draw the rows that a single process with a `world`
     times larger `batch_size` would draw; `rank` is the index of this process. If the last batch has
     fewer rows than there are processes, each process without a row gets a draw of the epoch
-    `BLANK`, for which the data set returns an empty room.
+    `BLANK`, for which the data set returns an empty room. If `repeated`, every epoch is the first.
     """
 
-    repeated = False
-    """True if every epoch is the first."""
-
-    def __init__(self, rows: int, batch_size: int, seed: int, rank: int = 0, world: int = 1):
+    def __init__(
+        self,
+        rows: int,
+        batch_size: int,
+        seed: int,
+        rank: int = 0,
+        world: int = 1,
+        repeated: bool = False,
+    ):
         self.rows, self.batch_size, self.seed = rows, batch_size, seed
-        self.rank, self.world = rank, world
+        self.rank, self.world, self.repeated = rank, world, repeated
         self.epoch = 0
         # Lightning sets the epoch of a loader's `sampler` and of its `batch_sampler.sampler`, but
         # not of the `batch_sampler`, so this batch sampler is also its own `sampler`.
@@ -70,6 +75,7 @@ def make_loader(
     workers: int,
     rank: int = 0,
     world: int = 1,
+    repeated: bool = False,
 ) -> DataLoader:
     """Make a loader of `SceneViews` (from a `ViewDataset`) or `RoomBoxes` (of true boxes).
 
@@ -78,7 +84,7 @@ def make_loader(
     pass batches, is too small.
     """
     workers = 0 if dataset.masks is None else workers
-    sampler = DrawSampler(len(dataset), batch_size, seed, rank, world)
+    sampler = DrawSampler(len(dataset), batch_size, seed, rank, world, repeated)
     if workers and _overfill_shared_memory(dataset.__getitems__(next(iter(sampler))), workers):
         workers = 0
     return DataLoader(

@@ -8,10 +8,11 @@ import pytest
 import torch
 from interrupting import CPU, interrupted
 from lightning.pytorch.callbacks import Callback
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tiny_runs import tiny_baseline, tiny_config
 
 from sceneprior.core.errors import InputWarning
-from sceneprior.training import validation
+from sceneprior.training import callbacks, validation
 from sceneprior.training.fit import fit
 from sceneprior.training.method import read_checkpoint
 
@@ -36,6 +37,12 @@ def curve(run: Path, stage: str, name: str) -> list[float]:
         return [float(row[name]) for row in csv.DictReader(file) if row.get(name)]
 
 
+def pictures(run: Path, stage: str) -> dict[str, list[int]]:
+    """Steps of the pictures in TensorBoard's file."""
+    events = EventAccumulator(str(run / stage)).Reload()
+    return {tag: [image.step for image in events.Images(tag)] for tag in events.Tags()["images"]}
+
+
 class Cameras(Callback):
     """The cameras of all batches of training and validation, and the rows of the latter."""
 
@@ -51,16 +58,18 @@ class Cameras(Callback):
             self.rows += batch.room_index.tolist()
 
 
-def test_training_does_not_notice_its_validation(val_shards, tmp_path, often):
-    """Every weight has the same bits without, with dropout and steps of the latents."""
+def test_training_does_not_notice_its_validation(val_shards, tmp_path, often, monkeypatch):
+    """Every weight has the same bits without, and without pictures, with dropout and steps of the
+    latents."""
     runs = {}
+    monkeypatch.setattr(callbacks, "DRAWING", 1.0)
     for every in (0, 1):
         given = {f"{stage}__val_every": every for stage in ("layout", "shape")}
         given |= {"model__decoder__dropout": 0.2, "layout__latent_noise": 0.1}
         config = tiny_config(val_shards, layout__epochs=4, data__view_fraction=0.5, **given)
         runs[every] = tmp_path / str(every)
         seen = Cameras()
-        fit(config, runs[every], False, ("csv",), CPU, [seen])
+        fit(config, runs[every], False, ("csv", "tensorboard"), CPU, [seen])
         assert seen.val.isdisjoint(seen.train)
         assert seen.rows == list(range(12)) * 7 * every
     for stage, epochs in (("layout", 4), ("shape", 3)):
@@ -71,7 +80,9 @@ def test_training_does_not_notice_its_validation(val_shards, tmp_path, often):
         for group in ("val", "val_rooms"):
             for name in ("class", "box", "completeness", "loss"):
                 assert len(curve(runs[1], stage, f"{group}/{name}")) == epochs
-        assert not curve(runs[0], stage, "val/loss")
+        assert not curve(runs[0], stage, "val/loss") and not pictures(runs[0], stage)
+        steps = [(3 if stage == "layout" else 2) * epoch for epoch in range(1, epochs + 1)]
+        assert pictures(runs[1], stage) == {"rooms/decoded": steps, "rooms/drawn": steps}
         assert len(curve(runs[1], stage, "train/gradient_norm")) == epochs
         assert len(curve(runs[1], stage, "train/latents_std")) == epochs
     assert curve(runs[1], "layout", "lr/2") == pytest.approx([0.05] * 3 + [0.005])
@@ -99,8 +110,9 @@ class Spoil(Callback):
                     parameter.fill_(-5)
 
 
-def test_the_best_epoch_is_kept(toy_shards, tmp_path):
+def test_the_best_epoch_is_kept(toy_shards, tmp_path, monkeypatch):
     """Also if the run is stopped and resumed in between."""
+    monkeypatch.syspath_prepend(Path(__file__).parent)
     given = {"layout__val_every": 1, "layout__keep": "best"}
     spoil = [{"test_validation.Spoil": None}]
     config = tiny_config(toy_shards, shape__epochs=1, callbacks=spoil, **given)

@@ -209,7 +209,6 @@ class SingleViewTraining(OneStageTraining):
 
     learning_rate: float = Field(1e-3, gt=0)
     schedule: Literal["constant", "cosine"] = "cosine"
-    """See `OneStageTraining`."""
 
 
 class SingleViewConfig(OneStageConfig):

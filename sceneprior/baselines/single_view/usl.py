@@ -57,9 +57,10 @@ class UslTraining(SingleViewTraining):
     mask: float = Field(1.0, ge=0)
     """Weight of the silhouette loss in the other views."""
     occlusion_slack: float = Field(0.15, ge=0, le=1)
-    """See `LossConfig`."""
+    """Weight of the distance by which a predicted 2D box extends beyond the observed one at a side
+    where another object may occlude it; at 0, objects may extend behind others without limit."""
     silhouettes: Literal["exact", "fast"] = "fast"
-    """See `ShapeConfig`."""
+    """`exact`: every face near a pixel counts; `fast`: the outline alone, in less time."""
 
 
 class UslConfig(SingleViewConfig):

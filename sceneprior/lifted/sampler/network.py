@@ -52,13 +52,19 @@ class SamplerConfig(TrainConfig):
 
     batch_size: int = Field(64, ge=1)
     learning_rate: float = Field(1e-3, gt=0)
+    """Peak of the cosine schedule; contents and tables of pairs learn 5 and 10 times as fast."""
     weight_decay: float = Field(0.01, ge=0)
+    """Decay of AdamW; that of tables of pairs is 10 times as large. More helps with few rooms."""
     clip_gradient: float = Field(1.0, ge=0)
     width: int = Field(128, ge=8)
-    """Width of the transformer encoder; its feed-forward layers are twice as wide."""
+    """Width of the transformer encoder; its feed-forward layers are twice as wide. A wider or
+    deeper encoder needs more rooms."""
     layers: int = Field(2, ge=1, le=100)
+    """Layers of the transformer encoder."""
     heads: int = Field(4, ge=1)
+    """Attention heads; must divide the width."""
     dropout: float = Field(0.1, ge=0, lt=1)
+    """Share of activations dropped in training; more of it delays overfitting to few rooms."""
     val_every: int = Field(10, ge=1)
     """Epochs between evaluations on the val rooms. The network that gives them the highest
     likelihood is kept, or the newest network if there are no val rooms."""

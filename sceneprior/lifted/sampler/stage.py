@@ -11,6 +11,9 @@ from jaxtyping import Float, Int
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
 
+from sceneprior.core.scene import Scene
+from sceneprior.lifted.config import TrainedLifted
+from sceneprior.lifted.drawing.draw import sample_scenes
 from sceneprior.lifted.prototypes import PosedRooms
 from sceneprior.lifted.sampler.frames import SYMMETRIES, turned_rooms
 from sceneprior.lifted.sampler.network import RoomSampler, SamplerConfig
@@ -98,6 +101,11 @@ class SamplerStage(lightning.LightningModule):
     def on_train_end(self) -> None:
         if self.least.isinf():  # stopped before the first validation, or there are no val rooms
             self.sampler.load_state_dict(self.learner.state_dict())
+
+    def examples(self, trained: TrainedLifted, count: int) -> dict[str, list[Scene]]:
+        """Rooms for pictures, `drawn` by the best network so far."""
+        names = [f"drawn_{row}" for row in range(count)]
+        return {"drawn": sample_scenes(trained, names, 0, None, None, False)}
 
     @torch.no_grad()
     def val_loss(self) -> Tensor:

@@ -6,6 +6,7 @@ import pytest
 import torch
 from lightning.pytorch import Trainer
 from rooms_of_boxes import TINY, sampler_rooms, small_sampler
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tiny_runs import tiny_lifted, tiny_sampler_config
 from torch import nn
 
@@ -88,6 +89,8 @@ def test_a_resumed_run_ends_as_one_that_was_never_stopped(toy_shards, tmp_path, 
 
     whole, again = tmp_path / "whole", tmp_path / "run"
     fit(tiny_sampler_config(toy_shards), whole, trainer_options=CPU)
+    events = EventAccumulator(str(whole / "sampler")).Reload()
+    assert events.Images("rooms/drawn")[-1].step == 3
     with monkeypatch.context() as patch, pytest.raises(StopError):
         patch.setattr("sceneprior.lifted.sampler.stage.SamplerStage", Stopped)
         fit(tiny_sampler_config(toy_shards), again, trainer_options=CPU)
