@@ -44,7 +44,7 @@ def trained(config, run):
     """The weights that the layout stage ends with, and the loss of each epoch."""
     fit(config, run, trainer_options=CPU, loggers=("csv",), resume=run.exists())
     with (run / "layout" / "metrics.csv").open(newline="") as file:
-        losses = [float(row["train/loss"]) for row in csv.DictReader(file)]
+        losses = [float(row["train/loss"]) for row in csv.DictReader(file) if row["train/loss"]]
     return read_checkpoint(run / "layout" / "final.ckpt")["state_dict"], losses
 
 
