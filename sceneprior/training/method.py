@@ -9,7 +9,7 @@ RUN/config.yaml            all settings, defaults included
 RUN/<stage>/last.ckpt      the stage's newest checkpoint, from which `--resume` continues
 RUN/<stage>/best.ckpt      the epoch with the least val/loss
 RUN/<stage>/final.ckpt     the finished stage, which commands load
-RUN/<stage>/metrics.csv    one line per epoch and per validation; TensorBoard's files are in the same folder
+RUN/<stage>/metrics.csv    one line per epoch and validation; TensorBoard's files are beside it
 """
 
 import contextlib
