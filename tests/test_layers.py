@@ -46,11 +46,11 @@ BUDGET = {
     "sceneprior/render": (4629, 23),
     "sceneprior/training": (1568, 9),
     "sceneprior/paper": (2787, 13),
-    "sceneprior/lifted": (8804, 43),
+    "sceneprior/lifted": (8779, 43),
     "sceneprior/baselines": (2915, 14),
     "sceneprior/evaluation": (4411, 21),
     "sceneprior/interchange": (899, 5),
-    "sceneprior/apps": (6792, 39),
+    "sceneprior/apps": (6793, 39),
 }
 """Most lines and modules of a folder. They go down freely, and up only in a commit that says what
 it bought and what went for it."""

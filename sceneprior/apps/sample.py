@@ -12,9 +12,9 @@ from sceneprior.core.files import read_json
 from sceneprior.core.repeatable import check_seed, single_threaded
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.views import RoomBoxes
-from sceneprior.lifted.config import SAMPLER, TrainedLifted
 from sceneprior.lifted.drawing.draw import sample_scenes
 from sceneprior.lifted.requests.request import RequestFile, RoomRequest
+from sceneprior.lifted.trained import SAMPLER, TrainedLifted
 from sceneprior.paper.prior import TrainedPrior
 from sceneprior.paper.sampling import decode_latents, draw_latents
 from sceneprior.training.method import Trained, TrainedReconstructor

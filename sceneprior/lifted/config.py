@@ -2,7 +2,6 @@
 
 import contextlib
 import warnings
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
@@ -19,7 +18,8 @@ from sceneprior.lifted.lifting.dataset import LiftedDataset
 from sceneprior.lifted.prototype_decoder import PrototypeConfig, PrototypeDecoder
 from sceneprior.lifted.sampler.network import RoomSampler, SamplerConfig
 from sceneprior.lifted.sampler.rooms import SamplerRooms
-from sceneprior.paper.prior import ModelConfig, PriorConfig, TrainedPrior
+from sceneprior.lifted.trained import SAMPLER, TrainedLifted
+from sceneprior.paper.prior import ModelConfig, PriorConfig
 from sceneprior.paper.settings import LatentStageConfig
 from sceneprior.paper.transformer import TransformerConfig
 from sceneprior.training.method import Stage, ready_copy
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from sceneprior.lifted.stages import LiftedStage
 
 
-SAMPLER = "sampler"
-"""Name of the distribution that draws rooms object by object with the sampler, without a latent."""
 FEW_ROOMS = 24
 """Number of training rooms below which training warns: docs/captures.md advises a few dozen."""
 
@@ -123,9 +121,7 @@ class LiftedConfig(PriorConfig):
             networks["sampler"] = self.build_sampler(self.sampler)
         return networks
 
-    def trained(
-        self, networks: nn.Module, stage: str, room_ids: tuple[str, ...]
-    ) -> "TrainedLifted":
+    def trained(self, networks: nn.Module, stage: str, room_ids: tuple[str, ...]) -> TrainedLifted:
         plain = super().trained(networks, stage, room_ids)
         sampler = ready_copy(networks.sampler) if hasattr(networks, "sampler") else None
         return TrainedLifted(plain.prior, plain.logits, room_ids, self, stage, sampler)
@@ -188,24 +184,3 @@ class LiftedConfig(PriorConfig):
             val = self._sampler_rooms("val").assign_prototypes(prototypes, rooms.backs)
         latents = nn.Embedding.from_pretrained(before.logits)
         return SamplerStage(before.prior, latents, sampler, stage, val, self.seed)
-
-
-@dataclass(frozen=True)
-class TrainedLifted(TrainedPrior):
-    """A prior whose shapes are looks, and the sampler of its run."""
-
-    sampler: RoomSampler | None = None
-    """None before the sampler's stage has begun, and in runs without a sampler."""
-
-    @property
-    def distribution(self) -> str:
-        """Default distribution of new rooms: `sampler` if the settings say so and the run has a
-        sampler; else the distribution of latents."""
-        with_sampler = self.sampler is not None and self.config.distribution == SAMPLER
-        return SAMPLER if with_sampler else self.latent_distribution
-
-    @property
-    def latent_distribution(self) -> str:
-        """Distribution of new latents, for tasks that need a latent."""
-        own = self.config.distribution
-        return own if self.remembers_rooms and own != SAMPLER else "paper"

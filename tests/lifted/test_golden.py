@@ -13,9 +13,9 @@ from golden_values import FOLDER, TAKE
 from tiny_runs import tiny_config, tiny_lifted
 
 from sceneprior.core.views import as_views
-from sceneprior.lifted.config import TrainedLifted
 from sceneprior.lifted.reconstruction.objects import answer_images
 from sceneprior.lifted.stages import latent_loss, lifted_losses, match_lifted, shape_code_loss
+from sceneprior.lifted.trained import TrainedLifted
 from sceneprior.paper.fit_image import FitSchedule, fit_latents_to_images
 from sceneprior.paper.interpolate import interpolate
 from sceneprior.paper.losses import layout_losses, mask_loss, seen_masks

@@ -151,7 +151,7 @@ def pack(
     from sceneprior.apps.priors.packed import write_packed
     from sceneprior.core.files import read_bytes
     from sceneprior.evaluation.score_table import read_scores
-    from sceneprior.lifted.config import SAMPLER
+    from sceneprior.lifted.trained import SAMPLER
     from sceneprior.paper.prior import TrainedPrior
 
     if out.exists() and (out.is_dir() or not overwrite):

@@ -15,7 +15,8 @@ from sceneprior.core.ground_truth import known_in_3d
 from sceneprior.core.repeatable import LARGEST_SEED
 from sceneprior.core.settings import Section, check_settings, read_settings
 from sceneprior.core.shards import iterate_rooms
-from sceneprior.lifted.config import SAMPLER, LiftedConfig
+from sceneprior.lifted.config import LiftedConfig
+from sceneprior.lifted.trained import SAMPLER
 from sceneprior.paper.config import PaperConfig
 from sceneprior.training.method import RunConfig
 

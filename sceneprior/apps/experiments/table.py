@@ -27,7 +27,7 @@ from sceneprior.evaluation.metric import ARROWS, EMPTY, TableColumn
 from sceneprior.evaluation.metrics import DECODED, METRICS
 from sceneprior.evaluation.score_table import Scores
 from sceneprior.evaluation.view_scores import ViewScores
-from sceneprior.lifted.config import SAMPLER
+from sceneprior.lifted.trained import SAMPLER
 from sceneprior.paper.sampling import marked
 from sceneprior.training.method import read_checkpoint
 

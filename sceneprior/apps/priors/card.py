@@ -10,7 +10,7 @@ from sceneprior.apps.priors.packed import shared_settings
 from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.shards import INDEX_NAME, read_index
 from sceneprior.evaluation.score_table import headings, score_rows
-from sceneprior.lifted.config import TrainedLifted
+from sceneprior.lifted.trained import TrainedLifted
 from sceneprior.paper.prior import TrainedPrior
 from sceneprior.training.method import Trained
 

@@ -31,7 +31,7 @@ from sceneprior.core.errors import InputError
 from sceneprior.core.files import cause_of, check_file, json_text, read_bytes, reading, write_whole
 from sceneprior.core.parts import KINDS
 from sceneprior.core.settings import Section, check_settings
-from sceneprior.lifted.config import TrainedLifted
+from sceneprior.lifted.trained import TrainedLifted
 from sceneprior.paper.prior import TrainedPrior
 from sceneprior.training.method import RunConfig, Trained
 

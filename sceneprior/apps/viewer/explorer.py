@@ -16,10 +16,10 @@ from sceneprior.apps.viewer.requested import clauses_of, line_of, read_line, sen
 from sceneprior.apps.viewer.shown import NOTHING_ASKED, Shown
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Opening, Scene
-from sceneprior.lifted.config import SAMPLER, TrainedLifted
 from sceneprior.lifted.requests.checks import answers
 from sceneprior.lifted.requests.request import RoomRequest
 from sceneprior.lifted.requests.wishes import Conditions, Wishes
+from sceneprior.lifted.trained import SAMPLER, TrainedLifted
 from sceneprior.paper.interpolate import RoomPath, even_places
 from sceneprior.paper.prior import TrainedPrior
 from sceneprior.paper.sampling import (

@@ -15,7 +15,6 @@ from sceneprior.core.classes import UnknownClassError, label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Mesh, Scene, SceneObject, Solid, quarter_turned
 from sceneprior.core.shell import rectangle
-from sceneprior.lifted.config import TrainedLifted
 from sceneprior.lifted.drawing.plans import RoomPlans, check_floor, plan_rooms
 from sceneprior.lifted.drawing.steps import NUMBERS, Particles, Rejections, place_next
 from sceneprior.lifted.lifting import HANGS_M
@@ -30,6 +29,7 @@ from sceneprior.lifted.requests.wishes import Conditions
 from sceneprior.lifted.sampler.contents import END
 from sceneprior.lifted.sampler.frames import FRAME_M, gaps_m, side_of
 from sceneprior.lifted.sampler.network import RoomSampler
+from sceneprior.lifted.trained import TrainedLifted
 
 OPEN_M = 3 * FRAME_M
 """Distance in metres beyond which a side of a drawn rectangle counts as empty: 1 of 370 sides in

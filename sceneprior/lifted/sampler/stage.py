@@ -12,12 +12,12 @@ from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
 
 from sceneprior.core.scene import Scene
-from sceneprior.lifted.config import TrainedLifted
 from sceneprior.lifted.drawing.draw import sample_scenes
 from sceneprior.lifted.prototypes import PosedRooms
 from sceneprior.lifted.sampler.frames import SYMMETRIES, turned_rooms
 from sceneprior.lifted.sampler.network import RoomSampler, SamplerConfig
 from sceneprior.lifted.sampler.rooms import SamplerRooms, frames_of, large_first, shuffled
+from sceneprior.lifted.trained import TrainedLifted
 from sceneprior.paper.losses import share_of_batch
 from sceneprior.paper.prior import ScenePrior
 from sceneprior.training.steps import (
