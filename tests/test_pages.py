@@ -56,6 +56,7 @@ ELSEWHERE = {
     "make demo": "tests/apps/experiments/test_demo.py runs the command that it is",
     "make test": "this is it",
     "compare/paper.yaml": "tests/apps/experiments/test_compare.py compares toys",
+    "compare/tuned.yaml": "tests/apps/experiments/test_compare.py compares toys",
     "compare/single_view.yaml": "tests/apps/experiments/test_compare.py compares toys",
     "--devices 2": "tests/training/test_processes.py trains in two processes",
     "--devices 4 --resume": "tests/training/test_slurm.py is stopped and queued again as there",
