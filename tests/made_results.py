@@ -6,13 +6,13 @@ from typing import Any
 import yaml
 from tiny_runs import tiny_baseline_settings, tiny_lifted_settings, write_tiny_config
 
+from sceneprior.apps.experiments.rows import NEW_ROOMS
 from sceneprior.core.files import write_json
-from sceneprior.evaluation.metrics import DECODED, METRICS
 from sceneprior.evaluation.score_table import FORMAT
 from sceneprior.evaluation.synthesis import VERSION
 
 SAMPLER = {"epochs": 3, "width": 16, "layers": 1, "heads": 2, "val_every": 1}
-KEYS = [metric.key for metric in (*METRICS, *DECODED) if metric.column]
+KEYS = [*NEW_ROOMS.columns]
 METHODS = {
     "paper": {},
     "lstm": {

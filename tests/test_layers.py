@@ -48,9 +48,9 @@ BUDGET = {
     "sceneprior/paper": (2787, 13),
     "sceneprior/lifted": (8809, 44),
     "sceneprior/baselines": (2915, 14),
-    "sceneprior/evaluation": (4411, 21),
+    "sceneprior/evaluation": (4437, 21),
     "sceneprior/interchange": (899, 5),
-    "sceneprior/apps": (6793, 39),
+    "sceneprior/apps": (7158, 41),
 }
 """Most lines and modules of a folder. They go down freely, and up only in a commit that says what
 it bought and what went for it."""

@@ -186,6 +186,8 @@ def cut_short(words: list[str], toys: Toys) -> list[str]:
             return [word for key, value in kept.items() for word in ("--set", f"{key}={value}")]
         case "eval-fid" | "evaluate":
             return ["--resamples", "2"] + (["-n", "8"] if "--run" in words else [])
+        case "compare" if "--against" in words:
+            return ["-n", "4"]
         case "prep-front":
             return ["--views-per-m2", "0.5", "--workers", "1"]
         case "prep-posed":

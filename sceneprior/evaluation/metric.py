@@ -45,6 +45,11 @@ class Estimate:
         """Value on the rooms themselves; None if the metric is undefined for this set."""
         return float(self.values[0]) if np.isfinite(self.values[0]) else None
 
+    @property
+    def undefined(self) -> "Estimate":
+        """The same estimate without values."""
+        return Estimate(np.full_like(self.values, np.nan), self.low, self.high)
+
     def interval(self) -> list[float] | None:
         """Lower and upper end of the interval; None if there is no value or there are no resamples.
 
@@ -204,6 +209,13 @@ class TableColumn:
     digits: int
     note: str = ""
     """The sentence about the column in the table's caption."""
+    direction: Direction = "none"
+    """The better direction; tables of rooms take the metric's."""
+
+    @property
+    def heading(self) -> str:
+        """The title with an arrow in the better direction."""
+        return self.title + ARROWS[self.direction]
 
 
 @dataclass(frozen=True)

@@ -38,6 +38,19 @@ FEWEST_FACES = 200
 """Smallest limit on the faces of one object, used on pages with many objects."""
 
 
+def render(template: str, **values: Any) -> str:
+    """The text of a page from a template of this folder; a variable of the template without a value
+    is an error."""
+    environment = Environment(
+        loader=PackageLoader("sceneprior.evaluation", "."),
+        autoescape=True,
+        undefined=StrictUndefined,  # a misspelt name is an error, not a blank
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(template).render(version=__version__, **values)
+
+
 def write_page(
     path: Path,
     template: str,
@@ -50,17 +63,9 @@ def write_page(
     """Write one self-contained HTML file of a few MB from a template of this folder, with the
     pictures and 3D models of groups of rooms, by the group's name in the template.
 
-    The page loads nothing from a network: the policy in its head forbids it. A variable of the
-    template without a value is an error. The groups `flat` have pictures alone, and `shell` is that
-    of `room_pictures`.
+    The page loads nothing from a network: the policy in its head forbids it. The groups `flat` have
+    pictures alone, and `shell` is that of `room_pictures`.
     """
-    environment = Environment(
-        loader=PackageLoader("sceneprior.evaluation", "."),
-        autoescape=True,
-        undefined=StrictUndefined,  # a misspelt name is an error, not a blank
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     script = files("sceneprior.evaluation").joinpath("model_viewer", "model-viewer-umd.min.js")
     shown = [(name, scene) for name, group in rooms.items() for scene in group]
     objects = sum(len(scene.objects) for name, scene in shown if name not in flat)
@@ -68,9 +73,9 @@ def write_page(
     drawn: dict[str, list[dict[str, str]]] = {name: [] for name in rooms}
     for name, scene in shown:
         drawn[name].append(room_pictures(scene, 0 if name in flat else most_faces, shell))
-    page = environment.get_template(template).render(
+    page = render(
+        template,
         viewer=Markup(script.read_text("utf-8")),
-        version=__version__,
         legend=_legend([scene for _, scene in shown]),
         **drawn,
         **values,

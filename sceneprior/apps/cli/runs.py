@@ -20,6 +20,9 @@ LEFT_OUT = 3
 """Exit status of a strict export that lacks an object."""
 
 
+TABLES = "compare/paper.yaml"
+
+
 def fit(
     config: Annotated[str, option("Config: a YAML file, or a shipped one (demo.yaml).")],
     run: Annotated[
@@ -81,9 +84,29 @@ def _main(arguments: list[str]) -> int | None:
 
 
 def compare(
+    sources: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help="Folders of scenes, priors, runs or result files (scores.json) to tabulate, in "
+            "place of trainings."
+        ),
+    ] = None,
+    against: Annotated[
+        Path | None, option("Shards with the real rooms that SOURCES are compared with.")
+    ] = None,
+    count: Annotated[
+        int | None,
+        option(
+            "Rooms of each source (default: the smallest folder's, or the number of training "
+            "rooms).",
+            "-n",
+            "--count",
+            min=2,
+        ),
+    ] = None,
     config: Annotated[
         str, option("Comparison: your YAML, or a shipped one (compare/single_view.yaml).")
-    ] = "compare/paper.yaml",
+    ] = TABLES,
     out: Annotated[Path, option("Folder for runs and tables.")] = Path("out/compare"),
     methods: Annotated[str | None, option("Methods, such as lifted,lstm.")] = None,
     rooms: Annotated[str | None, option("Kinds of rooms, such as bedroom.")] = None,
@@ -91,7 +114,32 @@ def compare(
     inception: options.Inception = None,
     accelerator: options.Accelerator = "auto",
 ) -> None:
-    """Train and evaluate methods on the same rooms, and tabulate them; run again to continue."""
+    """Tabulate methods: train and evaluate those of a config, or evaluate SOURCES as they are.
+
+    A stopped comparison is continued by running it again. Result files of other protocols are set
+    apart.
+    """
+    if sources:
+        if (config, methods, rooms, seeds) != (TABLES, None, None, None):
+            raise InputError(
+                "--config, --methods, --rooms and --seeds are for comparisons that train; leave "
+                "them out, or name no SOURCES."
+            )
+        from sceneprior.apps.experiments.sources import compare_sources
+        from sceneprior.evaluation.synthesis import EvalOptions
+
+        settings = EvalOptions(inception=inception, boxes=True)
+        tables = compare_sources(sources, against, out, count, settings)
+        typer.echo(f"Wrote {out / 'table.html'}, table.md and table.csv")
+        if tables > 1:
+            typer.echo(
+                f"Note: the results have {tables} protocols, and a table for each; values of two "
+                "tables cannot be compared.",
+                err=True,
+            )
+        return
+    if against is not None or count is not None:
+        raise InputError("--against and -n belong to SOURCES; name folders, priors or results.")
     from sceneprior.apps.experiments.compare import compare as run_comparison
     from sceneprior.apps.experiments.compare import part_of
     from sceneprior.apps.experiments.comparison import load_comparison

@@ -24,6 +24,7 @@ from sceneprior.apps.experiments.comparison import (
     shards_of,
     variants_of,
 )
+from sceneprior.apps.experiments.rows import form_of, rows_of
 from sceneprior.apps.experiments.table import write_tables
 from sceneprior.core.errors import InputError
 from sceneprior.evaluation.features import check_inception
@@ -105,7 +106,8 @@ def compare(
             elif evaluated:
                 left_out.append(run.title)
         if done:
-            write_tables(comparison, done, out)
+            rows = [row for run in done for row in rows_of(comparison, run)]
+            write_tables(rows, form_of(comparison), out)
     return Compared(out / "table.md" if done else None, failures, left_out)
 
 

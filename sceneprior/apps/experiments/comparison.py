@@ -84,9 +84,9 @@ class _Comparison(Section):
 
 
 class RoomComparison(_Comparison):
-    """Comparison of new rooms (the paper's Tables 1, 3 and 4), by `eval-fid`."""
+    """Comparison of new rooms (the paper's Tables 1, 3 and 4), by `evaluate`."""
 
-    command: ClassVar = "eval-fid"
+    command: ClassVar = "evaluate"
     option: ClassVar = "--distribution"
 
     task: Literal["new_rooms"] = "new_rooms"

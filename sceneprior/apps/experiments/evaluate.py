@@ -57,7 +57,7 @@ def evaluate_run(
     use: UseOptions | None = None,
     asked: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Score generated rooms against test rooms (`_scores`).
+    """Score generated rooms against test rooms (`scores_of`).
 
     The options' seed also draws the latents; `shards` and `distribution` default to the run's.
 
@@ -75,7 +75,7 @@ def evaluate_run(
             "with: --shards."
         )
     generate = partial(prior.sample, count, options.seed, distribution, **(asked or {}))
-    scores = _scores(generate, shards, options, use, trained)
+    scores = scores_of(generate, shards, options, use, trained)
     latents = "its own"
     if isinstance(trained, TrainedPrior):
         latents = marked(distribution or trained.distribution)
@@ -99,12 +99,12 @@ def evaluate_folder(
             "to take all of them, or make more."
         )
     rows = seeded_rows(len(scenes), count or len(scenes), options.seed)
-    scores = _scores(lambda: [scenes[row] for row in rows], shards, options, use)
+    scores = scores_of(lambda: [scenes[row] for row in rows], shards, options, use)
     scores["protocol"] |= {"scenes": folder.resolve().name, "n_scenes_available": len(scenes)}
     return scores
 
 
-def _scores(
+def scores_of(
     generate: Callable[[], list[Scene]],
     shards: Path | None,
     options: EvalOptions,

@@ -16,7 +16,7 @@ from sceneprior.evaluation.geometry import (
     point_count,
     triangles_of,
 )
-from sceneprior.evaluation.metric import USED, Counts, metric
+from sceneprior.evaluation.metric import USED, Counts, TableColumn, metric
 
 PIXELS = 256
 """Width and height of the floor map in pixels."""
@@ -120,7 +120,7 @@ def navigability(scene: Scene) -> Counts:
 )  # fmt: skip
 @metric(
     "physcene_reach", "R_reach: objects within reach (PhyScene)", "share; known floors only",
-    "higher", USED,
+    "higher", USED, column=TableColumn("in reach", 2, "in reach: objects that one can walk to"),
 )  # fmt: skip
 @metric(
     "physcene_walkable", "Walkable in one piece (PhyScene)",

@@ -19,7 +19,7 @@ from sceneprior.evaluation.geometry import (
     footprint,
     triangles_of,
 )
-from sceneprior.evaluation.metric import USED, Counts, metric
+from sceneprior.evaluation.metric import USED, Counts, TableColumn, metric
 from sceneprior.render.scene_simulators import TIMESTEP_S, scene_to_mjcf
 
 PITCH_M = 0.05
@@ -190,6 +190,7 @@ def settle(scene: Scene) -> Settled:
 
 @metric(
     "stable_share", "Stable for 5 s in MuJoCo, as generated", "share of objects", "higher", USED,
+    column=TableColumn("stable", 2, "stable: objects that stay put for 5 s in MuJoCo"),
     needs="solids of the objects (--settle all divides meshes, a minute or two each)",
     protocol={
         "stability": f"{SECONDS:g} s of MuJoCo in the rooms as they are, without walls; "

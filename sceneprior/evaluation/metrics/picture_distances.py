@@ -12,6 +12,7 @@ from scipy.spatial.distance import cdist
 from sceneprior.core.errors import InputError
 from sceneprior.evaluation.metric import (
     AGAINST_TEST,
+    COVERAGE,
     GENERATED,
     PICTURED,
     Comparison,
@@ -108,7 +109,7 @@ def gap_closed(ours: float, independent: float, real: float) -> float:
     All three are distances to the test rooms, with equal numbers of rooms. 0: as far from the test
     rooms as rooms of independently drawn objects (`independent_rooms`); 1: as near as real training
     rooms. Values below 0 and above 1 occur. If independent rooms are as near as real ones, there is
-    no gap, and the value is 1 if `ours <= real`, else 0.
+    no gap, and the value is undefined (NaN).
 
     Example: a third of the way is left.
 
@@ -116,7 +117,7 @@ def gap_closed(ours: float, independent: float, real: float) -> float:
         0.667
     """
     if independent <= real:
-        return float(ours <= real)
+        return np.nan
     return (independent - ours) / (independent - real)
 
 
@@ -136,7 +137,9 @@ def _gap(suffix: str, network: str, rooms: RoomSet, comparison: Comparison) -> E
         # Resamples repeat rooms, which raises all distances, so each distance's resamples are
         # shifted until their mean equals its value.
         values[:, 1:] += values[:, :1] - values[:, 1:].mean(axis=1, keepdims=True)
-    return Estimate(np.array([gap_closed(*three) for three in values.T.tolist()]))
+    found = Estimate(np.array([gap_closed(*three) for three in values.T.tolist()]))
+    # A gap that is not measurable says nothing: the share of it is noise, such as -1010%.
+    return found if np.isnan(found.values).mean() <= (1 - COVERAGE) / 2 else found.undefined
 
 
 def kernel_distances(
@@ -230,8 +233,9 @@ _COLUMNS = {
 _PROTOCOL = {
     "gap_closed_furnished": {
         "gap_closed": "(independent - generated) / (independent - real training), Frechet "
-        "distances to the test rooms, n_pictured rooms each; 1 or 0 where independent <= real; "
-        "_furnished: independent objects with their real meshes",
+        "distances to the test rooms, n_pictured rooms each; undefined if independent <= real in "
+        f"more than {(1 - COVERAGE) / 2:.1%} of the resamples; _furnished: independent objects "
+        "with their real meshes",
     },
     "fd_effnet_lite0_boxes": {
         "_boxes": "the same metric, all rooms drawn as boxes, real ones too (--boxes)"

@@ -28,6 +28,7 @@ from sceneprior.evaluation.metric import (
     Counts,
     Estimate,
     RoomSet,
+    TableColumn,
     mean_over_rooms,
     metric,
     ratio,
@@ -127,6 +128,7 @@ def _shares(name: str, found: Bool[np.ndarray, " objects"]) -> Counts:
 @metric(
     "sceneeval_col_objects", "COL: objects that collide (SceneEval)", "share", "lower", USED,
     protocol={"surfaces": "meshes of the scenes; boxes of objects without a mesh"},
+    column=TableColumn("colliding", 2, "colliding: objects that share volume with another"),
 )  # fmt: skip
 @metric("sceneeval_col_scenes", "COL: rooms with a collision (SceneEval)", "share", "lower", USED)
 def _sceneeval(scene: Scene) -> Counts:
@@ -219,6 +221,7 @@ metric(
 @metric(
     "sceneeval_oob_objects", "OOB: objects out of bounds (SceneEval)", "share; known floors only",
     "lower", USED,
+    column=TableColumn("out of bounds", 2, "out of bounds: objects that leave the floor"),
 )  # fmt: skip
 def out_of_bounds(scene: Scene) -> Counts:
     """Objects with less than 99% of their surface over the floor: SceneEval's OOB.

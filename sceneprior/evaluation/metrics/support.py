@@ -17,7 +17,7 @@ from sceneprior.evaluation.geometry import (
     triangles_of,
     vertical_crossings,
 )
-from sceneprior.evaluation.metric import USED, Counts, metric
+from sceneprior.evaluation.metric import USED, Counts, TableColumn, metric
 
 NEAR_M = 0.01
 """Length of the rays, and thickness of the object's outermost layer, in which they start."""
@@ -146,6 +146,7 @@ def _planes(scene: Scene) -> list[Triangles]:
     "sceneeval_supported", "SUPPORT: objects that rest on something (SceneEval)", "share",
     "higher", USED,
     protocol={"support": "expected by class (support_of), floor at height 0"},
+    column=TableColumn("supported", 2, "supported: objects that rest on something"),
 )  # fmt: skip
 def _support(scene: Scene) -> Counts:
     found = supported(scene)

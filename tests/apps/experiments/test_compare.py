@@ -12,10 +12,10 @@ from refusals import refused
 
 from sceneprior.apps.cli.commands import app
 from sceneprior.apps.config import load_any_run
-from sceneprior.apps.experiments import commands, table
+from sceneprior.apps.experiments import commands, rows
 from sceneprior.apps.experiments.compare import Compared, commands_of, compare, part_of
 from sceneprior.apps.experiments.comparison import load_comparison, runs_of
-from sceneprior.apps.experiments.table import costs_of, rows_of
+from sceneprior.apps.experiments.rows import costs_of, rows_of
 from sceneprior.core.errors import ConfigError, InputError
 from sceneprior.core.files import write_json
 from sceneprior.paper.fit_image import SCHEDULES, FitSchedule
@@ -155,15 +155,15 @@ def test_finished_commands_are_not_repeated_and_stay_in_the_table(begun, tmp_pat
     (run.folder / "run/shape/final.ckpt").unlink()
     calls.arguments, calls.error = [], None
     again(begun, tmp_path)
-    assert calls.names == ["fit", "eval-fid", "eval-fid"]
+    assert calls.names == ["fit", "evaluate", "evaluate"]
 
 
 def test_a_part_that_is_evaluated_otherwise_names_the_rows_it_leaves_out(begun, tmp_path, calls):
     done = again(begun, tmp_path, "lstm", count=5)
     assert done.table is None and done.left_out == ["toy, paper, seed 3"]
-    assert calls.names == ["fit", "eval-fid", "eval-fid"]
+    assert calls.names == ["fit", "evaluate", "evaluate"]
     again(begun, tmp_path, "paper", count=None)
-    assert calls.names[3:] == ["eval-fid", "eval-fid"]
+    assert calls.names[3:] == ["evaluate", "evaluate"]
     words = calls.arguments[-1]
     assert words[words.index("-n") + 1] == "12"  # as many as training rooms
 
@@ -206,7 +206,7 @@ def test_a_fit_of_single_views_is_scored_and_tabulated(toy_run, toy_shards, tmp_
     comparison = load_comparison(path)
     run = runs_of(comparison, tmp_path / "out")[0]
     shutil.copytree(toy_run, run.folder / "run")
-    monkeypatch.setattr(table, "costs_of", lambda run: {"parameters": 7})
+    monkeypatch.setattr(rows, "costs_of", lambda run: {"parameters": 7})
     shared = comparison.shared_options(toy_shards, None)
     scoring = commands_of(comparison, run, shared)[-1]
     commands.call(MAIN, scoring.arguments, tmp_path / "log")
