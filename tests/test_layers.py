@@ -50,7 +50,7 @@ BUDGET = {
     "sceneprior/baselines": (2915, 14),
     "sceneprior/evaluation": (4437, 21),
     "sceneprior/interchange": (899, 5),
-    "sceneprior/apps": (7158, 41),
+    "sceneprior/apps": (7229, 42),
 }
 """Most lines and modules of a folder. They go down freely, and up only in a commit that says what
 it bought and what went for it."""

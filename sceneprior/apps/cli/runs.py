@@ -233,7 +233,9 @@ def priors(
         str | None, typer.Argument(help="Prior whose card to print, as in `synthesize`.")
     ] = None,
 ) -> None:
-    """List the priors that the package ships, or print the card of one prior."""
+    """List the priors that the package ships, with their rooms, classes and scores (95% intervals),
+    or print the card of one prior."""
+    from sceneprior.apps.priors.listing import listing
     from sceneprior.apps.priors.packed import find_prior, is_packed, read_packed, shipped_priors
 
     if name is not None:
@@ -242,12 +244,9 @@ def priors(
             raise InputError(f"{name} is a run, which has no card; `sceneprior pack` writes one.")
         typer.echo(read_packed(path).card, nl=False)
         return
-    for known, path in shipped_priors().items():
-        packed = read_packed(path)
-        typer.echo(
-            f"{known:<20} {path.stat().st_size / 1e6:.1f} MB, {packed.said.settings['label_set']}, "
-            f"{packed.said.training_rooms} training rooms"
-        )
+    shipped = shipped_priors().items()
+    typer.echo("\n\n".join(listing(known, path) for known, path in shipped))
+    typer.echo("\n`sceneprior priors NAME` prints the card of one, with all scores.")
 
 
 def export(

@@ -249,13 +249,14 @@ def priors_that_draw(label: str) -> list[str]:
     >>> priors_that_draw("wardrobe")
     ['bedroom', 'demo-bedroom']
     """
-    names = []
-    for name, path in shipped_priors().items():
-        packed = read_packed(path)
-        drawn = packed.tensors["sampler.look_class"].unique().tolist()
-        if label in packed.said.classes and packed.said.classes.index(label) in drawn:
-            names.append(name)
-    return names
+    shipped = shipped_priors().items()
+    return [name for name, path in shipped if label in drawn_classes(read_packed(path))]
+
+
+def drawn_classes(packed: PackedPrior) -> list[str]:
+    """The classes that the sampler of a packed prior draws."""
+    drawn = packed.tensors["sampler.look_class"].unique().tolist()
+    return [name for index, name in enumerate(packed.said.classes) if index in drawn]
 
 
 def find_prior(where: str | Path) -> Path:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 from pathlib import Path
 
@@ -157,7 +158,15 @@ def test_pack_says_what_is_missing(command, sampler_run, toy_run, tmp_path):
 def test_priors_are_listed_and_their_cards_printed(command, packed):
     status, out, _ = command("priors")
     assert status == 0
-    assert [line.split()[0] for line in out.splitlines()] == list(shipped_priors())
+    *parts, _ = out.split("\n\n")
+    assert [part.split()[0] for part in parts] == list(shipped_priors())
+    for part in parts:
+        lines = dict(line.strip().split(": ", 1) for line in part.splitlines()[1:])
+        assert list(lines) == ["rooms", "trained on", "classes", "scores", "licence"]
+        assert re.search(r"near copies 0\.\d+ \(0\.\d+ to 0\.\d+\)", lines["scores"])
+        assert "MIT" in lines["licence"] or "CC-BY" in lines["licence"]
+        low, high = map(int, re.findall(r"\d+", lines["rooms"]))
+        assert 4 < low < high < 100
     status, out, _ = command("priors", "mine.prior")
     assert status == 0 and "# mine\n" in out and "Toys, made by hand; CC0." in out
 
