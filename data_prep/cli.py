@@ -4,6 +4,7 @@ Heavy imports are inside the functions, so that the command line starts quickly.
 """
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,9 +19,11 @@ if TYPE_CHECKING:
 def add_commands(app: typer.Typer, with_workers: Callable[..., Any]) -> None:
     """Mount the prep-* commands, inspect and make-homes; `with_workers` adds the options that
     choose where work runs."""
-    prep = (prep_front, prep_scannet, prep_posed, prep_dataset)
-    parallel = (*(with_workers(command, usual=None) for command in prep), with_workers(inspect))
-    for command in (make_homes, recipe, *parallel):
+    prep = partial(with_workers, usual=None)
+    for command in (
+        make_homes, prep(prep_front), recipe, prep(prep_scannet), prep(prep_posed),
+        prep(prep_dataset), with_workers(inspect),
+    ):  # fmt: skip
         app.command()(command)
 
 

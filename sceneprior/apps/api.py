@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,14 +16,18 @@ from sceneprior.apps.priors.packed import name_of, version_of
 from sceneprior.apps.sample import request_of, sample_rooms
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
+from sceneprior.core.parallel import run_tasks
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.views import DecodedScenes, ObservedImage
 from sceneprior.paper.prior import TrainedPrior
-from sceneprior.paper.sampling import Point, latent_of
+from sceneprior.paper.sampling import BATCH, Point, latent_of
 from sceneprior.training.method import Trained
 
 if TYPE_CHECKING:
     from sceneprior.apps.reconstruction.reconstruct import Reconstruction
+
+
+Then = Callable[[list[Scene], int], list[Scene]]
 
 
 def load(where: str | Path) -> "Prior":
@@ -73,6 +77,21 @@ class Prior:
             version = {}
         return {"prior": name_of(self.where), **version, "sceneprior": __version__}
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _loaded, (self.where,)  # each worker reads the weights itself, once
+
+    def _drawn(self, given: tuple[Any, ...], then: Then | None, **told: Any) -> list[Scene]:
+        """Rooms of `sample_rooms`, drawn in tasks of `BATCH` rooms."""
+        count = given[0]
+        # Other methods draw all their rooms at once.
+        size = BATCH if isinstance(self.trained, TrainedPrior) else max(count, 1)
+        blocks = [range(count)[first : first + size] for first in range(0, count, size)]
+        tasks = {
+            f"rooms {rows[0]} to {rows[-1]}": (self, given, rows, then, told) for rows in blocks
+        }
+        title = None if then is None else f"drawing rooms ({size} at a time)"
+        return [room for part in run_tasks(_draw, tasks, title) for room in part]
+
     def _told(self, rooms: Sequence[Scene], **more: Any) -> list[Scene]:
         """Rooms with `origin` and `more` added at the start of `extra`."""
         return [replace(room, extra={**self.origin, **more, **room.extra}) for room in rooms]
@@ -106,6 +125,7 @@ class Prior:
         want: str | Mapping[str, Any] | None = None,
         objects: Sequence[SceneObject] | None = None,
         cad: bool = False,
+        then: Then | None = None,
     ) -> list[Scene]:
         """Sample new rooms; the same seed gives the same rooms.
 
@@ -120,6 +140,8 @@ class Prior:
             objects: Objects that are already in the room, in the coordinates of the floor.
             cad: Replace decoded meshes by the most similar models of the package's own furniture
                 (docs/uses.md); given objects with a mesh keep it.
+            then: Function of some rooms and the number of the first, which is called in the
+                processes that draw them (docs/cluster.md); its results are returned instead.
 
         Requests need a prior with a sampler; see docs/requests.md. `extra["wishes"]` of a room
         lists each wish, the floor, openings and ceiling, and whether they hold.
@@ -143,8 +165,8 @@ class Prior:
             "objects": objects,
         }  # fmt: skip
         models, request = _models(objects or ()) if cad else None, request_of(asked)
-        rooms = sample_rooms(self.trained, count, seed, distribution, request, with_models=models)
-        return self._told(rooms, seed=seed, distribution=distribution or self.distribution)
+        given = (count, seed, distribution, request, False, None, models)
+        return self._drawn(given, then, seed=seed, distribution=distribution or self.distribution)
 
     def interpolate(self, start: Point, end: Point, steps: int = 9) -> list[Scene]:
         """Rooms on the geodesic between two latents, both ends included.
@@ -176,6 +198,7 @@ class Prior:
         openings: str | Sequence[Any] | None = None,
         ceiling_m: float | None = None,
         cad: bool = False,
+        then: Then | None = None,
     ) -> list[Scene]:
         """Complete a partly furnished room by the prior's sampler; given objects stay unchanged.
 
@@ -189,6 +212,7 @@ class Prior:
             openings: Requested doors and windows, in place of the scene's.
             ceiling_m: Requested height of the ceiling, in place of the scene's.
             cad: Replace decoded meshes by models of the package's own furniture, as in `sample`.
+            then: As in `sample`.
 
         Raises:
             InputError: an object cannot be used, there are more objects than the prior generates,
@@ -215,8 +239,7 @@ class Prior:
             own |= {"ceiling_m": scene.ceiling_m}
         request = request_of({**own, **asked})
         models = _models(scene.objects) if cad else None
-        rooms = sample_rooms(self.trained, count, seed, None, request, True, classes, models)
-        return self._told(rooms, seed=seed)
+        return self._drawn((count, seed, None, request, True, classes, models), then, seed=seed)
 
     def reconstruct(
         self, images: Sequence[ObservedImage], fit: str = "objects", restarts: int = 1
@@ -271,6 +294,18 @@ class Prior:
     def with_latents(self) -> TrainedPrior:
         """Return `trained`; raise InputError if it has no latent space."""
         return with_latents(self.trained, self.where)
+
+
+@cache
+def _loaded(where: str) -> Prior:
+    return load(where)
+
+
+def _draw(
+    prior: Prior, given: tuple[Any, ...], rows: range, then: Then | None, told: dict[str, Any]
+) -> list[Scene]:
+    rooms = prior._told(sample_rooms(prior.trained, *given, rows), **told)
+    return rooms if then is None else then(rooms, rows.start)
 
 
 def _models(given: Sequence[SceneObject]) -> Callable[[list[Scene]], list[Scene]]:

@@ -1,16 +1,17 @@
 """Write rooms to a folder: scene files, an overview picture and latents."""
 
-import os
-from collections.abc import Sequence
+import contextlib
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
-from rich.console import Console
-from rich.progress import Progress
 
 from sceneprior.core.files import PARTS, list_files, write_whole
+from sceneprior.core.parallel import check_shared, run_tasks
 from sceneprior.core.scene import Scene
 from sceneprior.core.scene_json import FORMAT
 from sceneprior.core.shell import ShellName
@@ -20,6 +21,8 @@ from sceneprior.render.scene_files import check_names, format_of, save
 from sceneprior.render.topdown import perspective, view_of
 
 PAGE_FILE = "rooms.html"
+BLOCK = 32
+"""Rooms that a task writes."""
 OVERVIEW_ROOMS = 24
 """Most rooms that the overview shows."""
 OVERVIEW_TILE = (240, 320)
@@ -36,11 +39,12 @@ def write_scene(scene: Scene, folder: Path, name: str, shell: ShellName = "none"
 
 
 def clear_scenes(folder: Path) -> None:
-    """Delete the old scenes of a folder, so that they are not mistaken for new ones.
+    """Make a folder, or delete its old scenes, so that they are not mistaken for new ones.
 
     Scene JSONs with their GLBs and PNGs, latents, the page, and the partial files of interrupted
     writers are deleted; all other files stay.
     """
+    Path(folder).mkdir(parents=True, exist_ok=True)
     for path in list_files(folder, "*.json"):
         if format_of(path) == FORMAT:
             for ending in (".glb", ".png", ".json"):
@@ -58,15 +62,43 @@ def write_scenes(scenes: Sequence[Scene], folder: Path, shell: ShellName = "none
     `latents.npz` is written if all scenes are decoded from latents.
     """
     check_names(scenes)
+    blocks = [scenes[first : first + BLOCK] for first in range(0, len(scenes), BLOCK)]
+    tasks = {f"rooms from {block[0].name} on": (block, len(scenes)) for block in blocks}
+    with writing_scenes(folder, shell) as (write, written):
+        run_tasks(write, tasks, "writing scenes")
+        written += scenes
+
+
+@contextlib.contextmanager
+def writing_scenes(
+    folder: Path, shell: ShellName = "none", with_meshes: bool = False
+) -> Iterator[tuple[Callable[[list[Scene], int], list[Scene]], list[Scene]]]:
+    """Replace the scenes of a folder, many at a time; its overview and latents are written last.
+
+    Yields:
+        A function for `then` of `Prior.sample`, which writes the rooms, and returns all of them
+        `with_meshes` or else those of the overview; and an empty list, for what `sample` returns.
+    """
     clear_scenes(folder)
-    with ThreadPoolExecutor(os.cpu_count()) as pool, Progress(console=Console(stderr=True)) as bar:
-        # Drawing, compression and disk access run in parallel.
-        done = pool.map(lambda scene: write_scene(scene, folder, scene.name, shell), scenes)
-        for _ in bar.track(done, total=len(scenes), description="Writing scenes"):
-            pass
+    scenes: list[Scene] = []
+    kept = sys.maxsize if with_meshes else OVERVIEW_ROOMS
+    yield partial(_write_some, folder=Path(folder), shell=shell, kept=kept), scenes
     sheet = overview(scenes, shell)
     write_whole(Path(folder) / "overview.png", png_bytes(sheet))
     write_latents(folder, scenes)
+
+
+def _write_some(
+    scenes: list[Scene], first: int, folder: Path, shell: ShellName, kept: int
+) -> list[Scene]:
+    from sceneprior.render.silhouettes.cpu.kernels import thread_count
+
+    check_shared(folder)
+    with ThreadPoolExecutor(thread_count()) as pool:
+        # Drawing, compression and disk access run in parallel.
+        [*pool.map(lambda scene: write_scene(scene, folder, scene.name, shell), scenes)]
+    rooms = enumerate(scenes, first)
+    return [scene if row < kept else scene.without_meshes() for row, scene in rooms]
 
 
 def overview(

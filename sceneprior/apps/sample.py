@@ -30,6 +30,7 @@ def sample_rooms(
     completes: bool = False,
     classes: Sequence[str] | None = None,
     with_models: Callable[[list[Scene]], list[Scene]] | None = None,
+    rows: range | None = None,
 ) -> list[Scene]:
     """Sample new rooms from a run of any method, by its sampler or a distribution of latents.
 
@@ -40,6 +41,7 @@ def sample_rooms(
         completes: Complete the room of the request, whose floor stays where it is, by the run's
             sampler, whatever its default.
         classes, with_models: See `sample_scenes`.
+        rows: The rooms to return, of the `count`; None for all.
 
     Raises:
         InputError: the run cannot draw such rooms.
@@ -50,10 +52,11 @@ def sample_rooms(
             "`sceneprior reconstruct` or `eval-svr`, or a run of another method."
         )
     check_seed(seed)
-    names = [f"seed{seed}_{row:04d}" for row in range(count)]
+    rows = range(count) if rows is None else rows
+    names = [f"seed{seed}_{row:04d}" for row in rows]
     has_sampler = isinstance(trained, TrainedLifted) and trained.sampler is not None
     if completes:
-        names = [f"complete_{row:02d}" for row in range(count)]
+        names = [f"complete_{row:02d}" for row in rows]
         distribution = SAMPLER if has_sampler else distribution
     if isinstance(trained, TrainedPrior) and (distribution or trained.distribution) == SAMPLER:
         if not isinstance(trained, TrainedLifted) or not has_sampler:
@@ -62,7 +65,9 @@ def sample_rooms(
                 f"{SAMPLER}, or train with a section `sampler` (`--config lifted/bedroom.yaml`)."
             )
         try:
-            return sample_scenes(trained, names, seed, request, classes, completes, with_models)
+            return sample_scenes(
+                trained, names, seed, request, classes, completes, with_models, rows.start
+            )
         except UnknownClassError as error:
             if not (others := priors_that_draw(error.label)):
                 raise
@@ -79,7 +84,7 @@ def sample_rooms(
             "take a prior with a sampler."
         )
     if isinstance(trained, TrainedPrior):
-        z = draw_latents(trained, count, seed, distribution)
+        z = draw_latents(trained, count, seed, distribution)[rows.start : rows.stop]
         found = decode_latents(trained, z, names)
         return found if with_models is None else with_models(found)
     if distribution is not None:
@@ -88,15 +93,18 @@ def sample_rooms(
             f"{trained.config.method}` has no latents; leave the option out."
         )
     rooms = trained.prior.sample(count, seed)
-    found = boxes_to_scenes(rooms, trained.config.label_set, names)
+    found = boxes_to_scenes(rooms, trained.config.label_set, names, rows.start)
     return found if with_models is None else with_models(found)
 
 
-def boxes_to_scenes(rooms: RoomBoxes, label_set_name: str, names: Sequence[str]) -> list[Scene]:
-    """Scenes of boxes without meshes; `extra` holds the objects' yaws, if they are known."""
+def boxes_to_scenes(
+    rooms: RoomBoxes, label_set_name: str, names: Sequence[str], first: int = 0
+) -> list[Scene]:
+    """Scenes of boxes without meshes, from row `first` on; `extra` holds the objects' yaws, if they
+    are known."""
     classes = label_set(label_set_name)
     scenes = []
-    for row, name in enumerate(names):
+    for row, name in enumerate(names, first):
         real = rooms.is_object[row]
         labels, boxes = rooms.object_class[row, real].tolist(), rooms.boxes_m[row, real].tolist()
         objects = tuple(

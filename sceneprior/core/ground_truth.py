@@ -51,6 +51,8 @@ def models_of(shards: Path, split: str) -> dict[str, tuple[str, ...]]:
 def stream_scenes(shards: Path, split: str, rows: Collection[int]) -> Iterator[Scene]:
     """Yield the rooms with these indices in `reference_scenes`, with meshes, one at a time."""
     for row, room in enumerate(iterate_rooms(shards, split)):
+        if row > max(rows):
+            return
         if row in rows:
             yield reference_scene(*room, shards)
 

@@ -188,7 +188,9 @@ def run_tasks(
         raise
     if failed:
         where.stop()
-        raise _error_of({name: failed[name] for name in tasks if name in failed}, len(tasks))
+        failed = {name: failed[name] for name in tasks if name in failed}
+        alike = not found and len({str(error) for error in failed.values()}) == 1
+        raise failed.popitem()[1] if alike else _error_of(failed, len(tasks))
     return [found[name] for name in tasks]
 
 
@@ -240,11 +242,9 @@ def _completed(
 def _error_of(failed: dict[str, Exception], total: int) -> Exception:
     """One error for all failed tasks: that of the first, with the names of the others."""
     (name, error), *others = failed.items()
-    sentence = sentence_of(error)
-    if type(error).__name__ == "KilledWorker":  # Dask's
-        sentence = _KILLED
+    killed = type(error).__name__ == "KilledWorker"  # Dask's
+    sentence = _KILLED if killed else sentence_of(error)
     if sentence is None:
-        error.add_note(f"In {name}.")
         return error
     if name not in sentence:
         sentence = f"{name}: {sentence}"

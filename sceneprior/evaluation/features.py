@@ -2,7 +2,6 @@
 come with a package, and Inception for FID, which the user provides as a file."""
 
 import hashlib
-import os
 from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -23,6 +22,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from sceneprior.core.classes import class_colors, label_set
 from sceneprior.core.errors import InputError
+from sceneprior.core.parallel import run_tasks
 from sceneprior.core.repeatable import single_threaded
 from sceneprior.core.scene import Scene
 from sceneprior.render.offscreen import SoftwareRenderer
@@ -164,7 +164,7 @@ def _in_chunks(images: np.ndarray, features: Callable[[Tensor], Tensor]) -> np.n
 
 SIZE_PX = 224
 """Width and height of the copies of pictures that AlexNet reads."""
-_DRAWN_AT_ONCE = 8
+_DRAWN_AT_ONCE, BLOCK = 8, 64
 
 Features = dict[str, np.ndarray]
 """Features of a set of rooms' pictures, one row per room.
@@ -202,29 +202,36 @@ class Drawing:
         fid = {} if self.inception is None else {"fid": INCEPTION | file_digest(self.inception)}
         return {"fd_effnet_lite0": EFFNET_LITE0, **fid}
 
-    def features(self, scenes: Iterable[Scene], on_progress: Callable[[int], object]) -> Features:
-        """Draw scenes from above, a few at a time, and compute the networks' features.
+    def features(self, title: str, read: Callable[..., Iterable[Scene]], *given: Any) -> Features:
+        """Draw rooms from above and compute the networks' features, in tasks of `BLOCK` rooms.
 
-        The calling thread draws, and one thread per processor runs the networks; the features are
-        bitwise the same for any number of threads. `on_progress` is called with the number of
-        scenes just done.
+        The rooms are those of `read(*given)`, whose last argument lists rooms or their indices; it
+        is called with parts of that list. The features are bitwise the same for any parts.
         """
-        protocol, stream = topdown_protocol(self.label_set), iter(scenes)
+        *others, rows = given
+        tasks = {
+            f"{title} rooms from {first} on": (self, read, *others, rows[first : first + BLOCK])
+            for first in range(0, len(rows), BLOCK)
+        }
+        parts = run_tasks(Drawing._features, tasks, f"drawing {title} rooms")
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+    def _features(self, read: Callable[..., Iterable[Scene]], *given: Any) -> Features:
+        """The calling thread draws, and one thread per processor runs the networks."""
+        from sceneprior.render.silhouettes.cpu.kernels import thread_count
+
+        protocol, stream = topdown_protocol(self.label_set), iter(read(*given))
         parts: list[Features] = []
         waiting: deque[Future[Features]] = deque()
-        # Count the processors that this process may use, not all of the machine's.
-        known = hasattr(os, "sched_getaffinity")
-        processors = len(os.sched_getaffinity(0)) if known else os.cpu_count() or 1
         efficientnet_lite0()  # loaded once, before the threads start
-        with single_threaded(), ThreadPoolExecutor(processors) as pool:
+        with single_threaded(), ThreadPoolExecutor(thread_count()) as pool:
             while (batch := list(islice(stream, _DRAWN_AT_ONCE))) or waiting:
                 if batch:
                     images = np.stack([topdown(scene, protocol) for scene in batch])
                     waiting.append(pool.submit(self._read, images))
                 # The queue is bounded, so that few pictures are in memory at a time.
-                if not batch or len(waiting) > processors + 1:
+                if not batch or len(waiting) > thread_count() + 1:
                     parts.append(waiting.popleft().result())
-                    on_progress(len(parts[-1]["picture_sha256"]))
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
     def _read(self, images: UInt8[np.ndarray, "n height width 3"]) -> Features:

@@ -1,15 +1,13 @@
 """Evaluate generated rooms against the test rooms of shards, with real and random baselines."""
 
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import distributions, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.progress import Progress
 
 from sceneprior.core.errors import InputError
 from sceneprior.core.ground_truth import (
@@ -255,35 +253,26 @@ def _draw_rooms(
     """
     generated = rooms.groups["generated"]
     groups = rooms.groups | {"generated": [generated[row] for row in rooms.pictured_rows]}
-    with Progress(console=Console(stderr=True)) as bars:
-
-        def draw(title: str, scenes: Iterable[Scene], count: int) -> Features:
-            bar = bars.add_task(f"Drawing {title} rooms", total=count)
-            return drawing.features(scenes, lambda done: bars.advance(bar, done))
-
-        def draw_real(split: str, rows: Sequence[int]) -> Features:
-            return draw(split, stream_scenes(shards, split, rows), len(rows))
-
-        test_rows = range(len(groups["test"]))
-        drawn = {
-            "test": draw_real(options.split, test_rows),
-            "train": draw_real("train", rooms.train_rows),
-        }
-        for group in sorted(set(groups) - set(drawn)):
-            drawn[group] = draw(group.replace("_", " "), groups[group], len(groups[group]))
-        # Rooms are read again with meshes, so that all training meshes are in memory only here.
-        count = len(rooms.train_rows)
-        furnished = independent_rooms(
-            reference_scenes(shards, "train"), count, options.seed, with_meshes=True
-        )
-        drawn["independent_meshes"] = draw("independent, furnished", furnished, count)
-        del furnished
-        for group in sorted(groups) if options.boxes else ():
-            as_boxes = drawn[group]
-            if group not in ("independent", "shuffled"):  # these are boxes already
-                plain = [scene.without_meshes() for scene in groups[group]]
-                as_boxes = draw(f"boxed {group}", plain, len(plain))
-            drawn[group] |= {f"{network}_boxes": rows for network, rows in as_boxes.items()}
+    splits = {"test": options.split, "train": "train"}
+    rows_of = {"test": range(len(groups["test"])), "train": rooms.train_rows}
+    drawn = {
+        group: drawing.features(split, stream_scenes, shards, split, rows_of[group])
+        for group, split in splits.items()
+    }
+    for group in sorted(set(groups) - set(drawn)):
+        drawn[group] = drawing.features(group.replace("_", " "), list, groups[group])
+    # Rooms are read again with meshes, so that all training meshes are in memory only here.
+    furnished = independent_rooms(
+        reference_scenes(shards, "train"), len(rooms.train_rows), options.seed, with_meshes=True
+    )
+    drawn["independent_meshes"] = drawing.features("independent, furnished", list, furnished)
+    del furnished
+    for group in sorted(groups) if options.boxes else ():
+        as_boxes = drawn[group]
+        if group not in ("independent", "shuffled"):  # these are boxes already
+            plain = [scene.without_meshes() for scene in groups[group]]
+            as_boxes = drawing.features(f"boxed {group}", list, plain)
+        drawn[group] |= {f"{network}_boxes": rows for network, rows in as_boxes.items()}
     return drawn
 
 

@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.progress import Progress
 
 from sceneprior.core.contact_resolution import make_stable
 from sceneprior.core.errors import InputError
 from sceneprior.core.ground_truth import independent_rooms, reference_scenes, shuffled_rooms
+from sceneprior.core.parallel import run_tasks
 from sceneprior.core.scene import Scene
 from sceneprior.evaluation.metric import METHOD, Counts, Estimate, ratio, resample_counts
 from sceneprior.evaluation.metrics import USE
@@ -55,21 +54,17 @@ def measure_use(
         no generated room has (a floor, doors or windows).
     """
     columns: dict[str, dict[str, Estimate]] = {}
-    with Progress(console=Console(stderr=True)) as bars:
-        bar = bars.add_task("Measuring rooms", total=sum(map(len, sets.values())))
-        for number, (name, scenes) in enumerate(sets.items()):
-            measured = []
-            for scene in scenes:
-                measured.append(measure_room(scene, options))
-                bars.advance(bar)
-            # These seeds are far from those of `evaluate_synthesis`.
-            counts = resample_counts(len(scenes), resamples, (seed, 100 + number))
-            columns[name] = {}
-            for metric in USE:
-                pairs = [room.get(metric.key, (0.0, 0.0)) for room in measured]
-                sums, numbers = np.array(pairs, dtype=float).reshape(-1, 2).T
-                high = np.inf if metric.key.endswith("litres") else 1.0
-                columns[name][metric.key] = ratio(sums, numbers, counts, high)
+    for number, (name, scenes) in enumerate(sets.items()):
+        rooms = {f"room {row} of {name}": (scene, options) for row, scene in enumerate(scenes)}
+        measured = run_tasks(measure_room, rooms, f"measuring {name} rooms")
+        # These seeds are far from those of `evaluate_synthesis`.
+        counts = resample_counts(len(scenes), resamples, (seed, 100 + number))
+        columns[name] = {}
+        for metric in USE:
+            pairs = [room.get(metric.key, (0.0, 0.0)) for room in measured]
+            sums, numbers = np.array(pairs, dtype=float).reshape(-1, 2).T
+            high = np.inf if metric.key.endswith("litres") else 1.0
+            columns[name][metric.key] = ratio(sums, numbers, counts, high)
     left_out = {}
     for metric in USE:
         if columns["generated"][metric.key].value is None:
@@ -119,7 +114,8 @@ def evaluate_use(
     names = common_label_set(generated)
     notes = list[str]()
     if use.stand:
-        stable = [make_stable(scene) for scene in generated]
+        tasks = {f"room {row}": (scene,) for row, scene in enumerate(generated)}
+        stable = run_tasks(make_stable, tasks, "settling rooms")
         generated = [each.scene for each in stable]
         notes += [said for each in stable for said in each.left_out]
     sets: dict[str, Sequence[Scene]] = {"generated": generated}

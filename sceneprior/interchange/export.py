@@ -11,9 +11,10 @@ import numpy as np
 
 from sceneprior.core.boxes import yaw_rotation
 from sceneprior.core.colliders import colliders, is_fixed, mass_kg, mesh_of
-from sceneprior.core.contact_resolution import make_stable
+from sceneprior.core.contact_resolution import Stable, make_stable
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import write_json, write_whole
+from sceneprior.core.parallel import check_shared, run_tasks
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.core.shell import THICK_M, Shell, ShellName, shell_meshes, shell_of
 from sceneprior.interchange.box_lists import write_atiss
@@ -25,6 +26,8 @@ from sceneprior.render.scene_simulators import scene_to_mjcf, scene_to_usd
 PREFIX = "sceneprior"
 """Prefix of model ids, by which SceneEval identifies a model's data set."""
 _Z_UP = {"up": [0, 0, 1], "front": [0, 1, 0]}
+BLOCK = 16
+"""Rooms that a task makes stable and writes."""
 GROWN_M = 0.01
 """Threshold in metres: a note mentions walls that furniture pushed outwards by more."""
 
@@ -76,10 +79,12 @@ def export_scenes(
 
 
 def _export_standing(scenes: Sequence[Scene], to: str, folder: Path, shell: ShellName) -> Notes:
-    """Make objects stable and write the rooms."""
-    found = [make_stable(scene) for scene in scenes]
+    """Make objects stable and write the rooms, in tasks of `BLOCK` rooms."""
+    folder.mkdir(parents=True, exist_ok=True)
+    blocks = [scenes[first : first + BLOCK] for first in range(0, len(scenes), BLOCK)]
+    tasks = {f"rooms from {block[0].name} on": (block, to, folder, shell) for block in blocks}
+    found = [room for part in run_tasks(_settle, tasks, "settling rooms") for room in part]
     standing, notes = [each.scene for each in found], list[str]()
-    SIMULATORS[to](standing, folder, shell)
     changes = sum((each.changes for each in found), Counter[str]())
     if listed := ", ".join(f"{count} {change}" for change, count in changes.items() if count):
         total = sum(len(scene.objects) for scene in scenes)
@@ -93,6 +98,13 @@ def _export_standing(scenes: Sequence[Scene], to: str, folder: Path, shell: Shel
             "m, because furniture stands there."
         )
     return Notes(notes, [said for each in found for said in each.left_out])
+
+
+def _settle(scenes: Sequence[Scene], to: str, folder: Path, shell: ShellName) -> list[Stable]:
+    check_shared(folder)
+    found = [make_stable(scene) for scene in scenes]
+    SIMULATORS[to]([each.scene for each in found], folder, shell)
+    return [each._replace(scene=each.scene.without_meshes()) for each in found]
 
 
 def _write_mujoco(scenes: Sequence[Scene], folder: Path, shell: ShellName) -> None:

@@ -22,10 +22,11 @@ app = typer.Typer(
 add_commands(app, with_workers)
 for command in (
     with_workers(runs.fit), evaluation.report,
-    rooms.synthesize, rooms.interpolate, rooms.complete, rooms.retrieve,
+    with_workers(rooms.synthesize), rooms.interpolate, with_workers(rooms.complete),
+    rooms.retrieve,
     rooms.reconstruct, evaluation.eval_svr,
-    runs.pack, runs.priors, runs.export,
-    evaluation.evaluate, evaluation.eval_fid,
+    runs.pack, runs.priors, with_workers(runs.export),
+    with_workers(evaluation.evaluate), with_workers(evaluation.eval_fid),
     runs.compare, runs.demo, rooms.view,
 ):  # fmt: skip
     app.command()(command)

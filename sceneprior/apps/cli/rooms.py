@@ -41,13 +41,13 @@ def synthesize(
     """
     check_free(out, overwrite)  # before imports that take seconds
     from sceneprior.apps.api import load
-    from sceneprior.apps.rooms import PAGE_FILE, write_scenes
+    from sceneprior.apps.rooms import PAGE_FILE, writing_scenes
     from sceneprior.evaluation.page import write_rooms_page
 
     drawn = options.checked_shell(shell or "none")
     prior = load(run)
-    scenes = prior.sample(count, seed, distribution, **asked, cad=cad)
-    write_scenes(scenes, out, drawn)
+    with writing_scenes(out, drawn, html) as (write, scenes):
+        scenes += prior.sample(count, seed, distribution, **asked, cad=cad, then=write)
     options.note_unmet(scenes)
     origin = distribution or prior.distribution
     if html:
@@ -108,7 +108,7 @@ def complete(
     from dataclasses import replace
 
     from sceneprior.apps.api import load
-    from sceneprior.apps.rooms import write_scenes
+    from sceneprior.apps.rooms import writing_scenes
     from sceneprior.render.scene_files import load_scene
 
     drawn = options.checked_shell(shell or "none")
@@ -116,8 +116,8 @@ def complete(
     scene = replace(scene, objects=(*scene.objects, *asked.pop("objects", ())))
     wanted = None if classes is None else [label.strip() for label in classes.split(",")]
     prior = load(run)
-    scenes = prior.complete(scene, count, seed, wanted, **asked, cad=cad)
-    write_scenes(scenes, out, drawn)
+    with writing_scenes(out, drawn) as (write, scenes):
+        scenes += prior.complete(scene, count, seed, wanted, **asked, cad=cad, then=write)
     options.note_unmet(scenes)
     given_objects = f"{len(scene.objects)} given object{'s' * (len(scene.objects) != 1)}"
     typer.echo(f"Wrote {options.rooms_in_words(count)} around {given_objects} to {out}")

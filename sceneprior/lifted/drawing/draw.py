@@ -75,7 +75,12 @@ class SampledRooms(NamedTuple):
 
 @torch.no_grad()
 def draw_rooms(
-    sampler: RoomSampler, conditions: Conditions, count: int, seed: int, may_lack: bool = False
+    sampler: RoomSampler,
+    conditions: Conditions,
+    count: int,
+    seed: int,
+    may_lack: bool = False,
+    first: int = 0,
 ) -> SampledRooms:
     """Sample new rooms that meet conditions.
 
@@ -90,6 +95,7 @@ def draw_rooms(
 
     Args:
         may_lack: Required objects may be missing from all rooms.
+        first: Number of the first room, of those that the seed draws.
 
     Raises:
         InputError: no room can meet the conditions, or none was found; the message says why.
@@ -106,7 +112,7 @@ def draw_rooms(
     while waiting:
         if number % effort.attempts_per_plan == 0:
             planned = {row: at for at, row in enumerate(waiting)}
-            draws = [_random(seed, row, 0, number) for row in waiting]
+            draws = [_random(seed, first + row, 0, number) for row in waiting]
             plans = plan_rooms(sampler, conditions, draws, number >= effort.whole)
         # The very last attempt is by itself, because it leaves out objects.
         until = effort.attempts_per_plan * (number // effort.attempts_per_plan + 1)
@@ -116,19 +122,19 @@ def draw_rooms(
             some = waiting[start : start + size]
             tried = [(row, attempt) for attempt in attempts for row in some]
             own = plans.take(torch.tensor([planned[row] for row, _ in tried]))
-            draws = [_random(seed, row, 1, attempt) for row, attempt in tried]
+            draws = [_random(seed, first + row, 1, attempt) for row, attempt in tried]
             particles, best, lacking = _furnish(
                 sampler, conditions, own, draws, number, effort, rejections
             )
             # The first successful attempt counts, so later ones are overwritten.
-            first = {tried[at][0]: at for at in reversed(range(len(tried))) if best[at] >= 0}
-            for row, at in first.items():
+            earliest = {tried[at][0]: at for at in reversed(range(len(tried))) if best[at] >= 0}
+            for row, at in earliest.items():
                 shapes[row], missing[row] = own.shapes[at], tuple(lacking[at])
-            to, chosen = torch.tensor([*first]).long(), torch.tensor([*first.values()]).long()
+            to, chosen = torch.tensor([*earliest]).long(), torch.tensor([*earliest.values()]).long()
             for whole, part in zip(_parts(rooms), _parts(particles.rooms), strict=True):
                 whole[to] = part[best[chosen]]
             rectangle_m[to] = own.rectangle_m[chosen]
-            finished |= first.keys()
+            finished |= earliest.keys()
         waiting = [row for row in waiting if row not in finished]
         number = attempts.stop
     if count and all(missing) and not may_lack:
@@ -221,8 +227,9 @@ def sample_scenes(
     classes: Sequence[str] | None,
     floor_stays: bool,
     with_models: Callable[[list[Scene]], list[Scene]] | None = None,
+    first: int = 0,
 ) -> list[Scene]:
-    """Sample a room with meshes for each name; see `draw_rooms`.
+    """Sample a room with meshes for each name; see `draw_rooms` (also for `first`).
 
     `extra` of a room lists the rows of the given objects (`given`), the request without them
     (`request`), and whether each wish holds (`wishes`).
@@ -254,7 +261,7 @@ def sample_scenes(
         may_meet = {frozenset(label_names[index] for index in pair) for pair in meets}
         conditions = request.conditions(known, labels, most, floor_stays, may_meet)
         told = {key: part for key, part in request.parts().items() if key != "objects"}
-    drawn = draw_rooms(sampler, conditions, len(names), seed, may_lack=classes is not None)
+    drawn = draw_rooms(sampler, conditions, len(names), seed, classes is not None, first)
     scenes = []
     for row, name in enumerate(names):
         extra: dict[str, Any] = {}

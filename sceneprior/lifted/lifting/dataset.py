@@ -245,7 +245,7 @@ class LiftedDataset(RoomDataset):
 
 
 def _lift_shard(
-    path: Path, key: str, chosen: Sequence[Int[np.ndarray, " views"]], shape: ShapeGrid
+    path: Path, key: str, chosen: Sequence[np.ndarray], shape: ShapeGrid
 ) -> dict[str, np.ndarray]:
     """The fields of `LiftedBoxes` and of a `RayPool` of all objects of a shard, their visual hulls
     (`bits`, eight cells per byte), and the rooms' walls, from the `chosen` views of each room."""
