@@ -51,14 +51,16 @@ class Effort(NamedTuple):
     whole: int
     """Attempts in which no object may be left out. Later ones place required objects first, and
     leave out others without a place; the last one leaves out any."""
+    sound: int
+    """Attempts in which no place may add a fault of function."""
     together: int
     """Particles for which attempts are made side by side, if fewer rooms are left; the first
     successful attempt counts. A step takes about as long for one room as for these."""
 
 
-PLAIN = Effort(particles=1, attempts=48, attempts_per_plan=16, whole=47, together=32)
+PLAIN = Effort(particles=1, attempts=48, attempts_per_plan=16, whole=47, sound=0, together=32)
 """For rooms whose conditions are inputs of the network: a rectangle, and given objects."""
-REQUESTED = Effort(particles=6, attempts=12, attempts_per_plan=1, whole=4, together=1)
+REQUESTED = Effort(particles=6, attempts=12, attempts_per_plan=1, whole=4, sound=3, together=1)
 """For rooms with a floor, openings or wishes, which places are checked against."""
 
 
@@ -112,7 +114,7 @@ def draw_rooms(
     while waiting:
         if number % effort.attempts_per_plan == 0:
             planned = {row: at for at, row in enumerate(waiting)}
-            draws = [_random(seed, first + row, 0, number) for row in waiting]
+            draws = [np.random.default_rng([seed, first + row, 0, number]) for row in waiting]
             plans = plan_rooms(sampler, conditions, draws, number >= effort.whole)
         # The very last attempt is by itself, because it leaves out objects.
         until = effort.attempts_per_plan * (number // effort.attempts_per_plan + 1)
@@ -122,7 +124,9 @@ def draw_rooms(
             some = waiting[start : start + size]
             tried = [(row, attempt) for attempt in attempts for row in some]
             own = plans.take(torch.tensor([planned[row] for row, _ in tried]))
-            draws = [_random(seed, first + row, 1, attempt) for row, attempt in tried]
+            draws = [
+                np.random.default_rng([seed, first + row, 1, attempt]) for row, attempt in tried
+            ]
             particles, best, lacking = _furnish(
                 sampler, conditions, own, draws, number, effort, rejections
             )
@@ -140,10 +144,6 @@ def draw_rooms(
     if count and all(missing) and not may_lack:
         raise InputError(_in_the_way(rejections, missing[0], conditions.classes))
     return SampledRooms(replace(rooms, rectangle_m=rectangle_m), tuple(shapes), tuple(missing))
-
-
-def _random(*seed: int) -> np.random.Generator:
-    return np.random.default_rng(seed)
 
 
 def _parts(rooms: PosedRooms) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -200,8 +200,11 @@ def _furnish(
         good = good & ~(added & (gaps.amax(dim=-1) > OPEN_M))
     merit = good.int()
     if rules is not None:  # the room with the fewest faults
+        allowed = [len(own.faults(there)) for own, there in zip(rules, given, strict=True)]
         for row, own in enumerate(particles.furniture()):
-            merit[row] *= 100 - len(rules[int(particles.room[row])].faults(own))
+            faults = len(rules[room := int(particles.room[row])].faults(own))
+            merit[row] *= 100 - faults
+            good[row] &= number >= effort.sound or faults <= allowed[room]
     good, merit = (part.unflatten(0, (-1, effort.particles)) for part in (good, merit))
     best = torch.arange(len(draws)) * effort.particles + merit.argmax(dim=1)
     return particles, best.where(good.any(dim=1), -1), missing
@@ -271,8 +274,7 @@ def sample_scenes(
             extra = {"request": told, "wishes": []}
         if conditions.objects:
             extra["given"] = list(range(len(conditions.objects)))
-        turns_given = with_models is not None
-        scene = _scene_of(trained, name, conditions, drawn, row, turns_given)
+        scene = _scene_of(trained, name, conditions, drawn, row, with_models is not None)
         scenes.append(_answered(replace(scene, extra=extra), sampler, conditions, drawn, row))
     if with_models is None:
         return scenes
@@ -323,14 +325,13 @@ def _scene_of(
         turned = quarter_turned(size, int(fronts[item]) + 2)._replace(
             confidence=float(confidence[item])
         )
+        own = SceneObject(conditions.classes[index], center, size, mesh, turned, solids)
         if item < len(conditions.objects):
             own = conditions.objects[item]
             if own.mesh is None:
                 yaw = own.turned or (turned if turns_given else None)
                 own = replace(own, mesh=mesh, solids=solids, turned=yaw)
-            objects.append(own)
-            continue
-        objects.append(SceneObject(conditions.classes[index], center, size, mesh, turned, solids))
+        objects.append(own)
     if (shape := drawn.shapes[row]) is None:
         middle, extents = rooms.rectangle_m[row].double().numpy().reshape(2, 2)
         floor_m = rectangle(middle - extents / 2, middle + extents / 2).round(3)

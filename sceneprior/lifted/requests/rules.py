@@ -13,6 +13,7 @@ from sceneprior.core.arrangements import (
     BEDS,
     NIGHTSTANDS,
     OPENED,
+    Piece,
     end_of_bed,
     findings,
     floor_beside,
@@ -167,6 +168,8 @@ class PlacementRules:
                 if place is None or place[0] not in heads(bed):
                     failed.add(("beside the head", (row,)))
                 else:
+                    if _turned_apart(bed, pieces[row]):
+                        failed.add(("turned as the bed", (row,)))
                     strip = floor_beside(bed, place[1], PATH_M)
                     used_from["path to the bedside", (row,)] = strip
         if self._paths is not None and used_from:
@@ -217,6 +220,13 @@ def backed_by_walls(
     gaps_m = np.abs(((middles_m - sides_m) * inward).sum(axis=1))
     at_wall = shapely.distance(shapely.points(middles_m), shape.floor.polygon.exterior) <= WALL_M
     return np.asarray((gaps_m > FLUSH_M) | at_wall)
+
+
+def _turned_apart(one: Piece, other: Piece) -> bool:
+    """True if the fronts of two pieces are known and point in different directions."""
+    if one.front is None or other.front is None:
+        return False
+    return bool(one.front @ other.front < 0.5)
 
 
 class Paths:

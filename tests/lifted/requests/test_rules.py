@@ -126,6 +126,9 @@ def test_a_wardrobe_leaves_paths_to_its_front_and_to_both_sides_of_a_bed(wardrob
     room = Furniture(np.array(boxes), np.array([0, 1, 2, 2]), np.full(4, -1), fronts)
     door = Opening("door", (-1.9, -1.5), (-1.0, -1.5), 0.0, 2.0)
     shape = RoomShape(Floor(read_floor("4x3")), (door,))
-    failed = PlacementRules(shape, [], classes, room.rows([])).faults(room)
+    rules = PlacementRules(shape, [], classes, room.rows([]))
+    failed = rules.faults(room)
     assert {row for key, (row, *_) in failed if key == "path to the bedside"} == closed
     assert (("path to the front", (0,)) in failed) == bool(closed)
+    turned = room._replace(front=np.array([front, (0, -1), (0, -1), (0, 1)], float))
+    assert rules.faults(turned) - failed == {("turned as the bed", (3,))}
