@@ -44,7 +44,7 @@ BUDGET = {
     "sceneprior/core": (6621, 30),
     "sceneprior/furniture": (591, 4),
     "sceneprior/render": (4629, 23),
-    "sceneprior/training": (1568, 9),
+    "sceneprior/training": (1572, 9),
     "sceneprior/paper": (2787, 13),
     "sceneprior/lifted": (8827, 44),
     "sceneprior/baselines": (2915, 14),

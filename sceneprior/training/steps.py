@@ -170,7 +170,8 @@ def log_losses(
     of its `log` takes a millisecond, and a step on a GPU ten.
     """
     values = values | {"loss": total}
-    how = {"on_step": False, "on_epoch": True, "sync_dist": True, "add_dataloader_idx": False}
+    how: dict[str, Any] = {"on_step": False, "on_epoch": True, "sync_dist": True}
+    how["add_dataloader_idx"] = False
     if not module.training:
         group = getattr(module, "log_as", "val")
         named = {f"{group}/{name}": value for name, value in values.items() if group}

@@ -27,6 +27,9 @@ STEPS_BETWEEN = 60 * FIT_STEPS
 class ValidatedModule(lightning.LightningModule):
     """A module whose training step, called in evaluation mode, computes the losses `val/*`."""
 
+    latents: nn.Embedding
+    """The rooms' latents, in a module that has some."""
+
     def validation_step(self, batch: Any, batch_idx: int, dataloader_idx: int = 0) -> None:
         """The losses of a batch; the second loader has val rooms, whose latents are fitted."""
         if dataloader_idx == 0:
@@ -39,7 +42,7 @@ class ValidatedModule(lightning.LightningModule):
 
     def _fit_latents(self, batch: Any) -> None:
         """Log the losses of rooms as `val_rooms/*`, after their latents alone were trained."""
-        trained: nn.Embedding = self.latents  # type: ignore[assignment]
+        trained = self.latents
         rows = int(batch.room_index.max()) + 1
         start = torch.zeros(rows, trained.embedding_dim, device=self.device)
         self.latents = fitted = nn.Embedding.from_pretrained(start, freeze=False)
