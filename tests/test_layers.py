@@ -46,7 +46,7 @@ BUDGET = {
     "sceneprior/render": (4629, 23),
     "sceneprior/training": (1572, 9),
     "sceneprior/paper": (2787, 13),
-    "sceneprior/lifted": (8827, 44),
+    "sceneprior/lifted": (8835, 44),
     "sceneprior/baselines": (2915, 14),
     "sceneprior/evaluation": (4429, 21),
     "sceneprior/interchange": (911, 5),

@@ -15,7 +15,14 @@ from sceneprior.core.classes import UnknownClassError, label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Mesh, Scene, SceneObject, Solid, quarter_turned
 from sceneprior.core.shell import rectangle
-from sceneprior.lifted.drawing.plans import RoomPlans, check_floor, plan_rooms
+from sceneprior.lifted.drawing.plans import (
+    PLAIN,
+    REQUESTED,
+    Effort,
+    RoomPlans,
+    check_floor,
+    plan_rooms,
+)
 from sceneprior.lifted.drawing.steps import NUMBERS, Particles, Rejections, place_next
 from sceneprior.lifted.lifting import HANGS_M
 from sceneprior.lifted.prototype_decoder import PrototypeDecoder
@@ -36,32 +43,6 @@ OPEN_M = 3 * FRAME_M
 the training rooms exceeds it."""
 BATCH = 512
 """Particles furnished at a time."""
-
-
-class Effort(NamedTuple):
-    """Numbers of particles and attempts at rooms."""
-
-    particles: int
-    """Particles of a room. With more, an attempt meets rarer wishes, in proportionally more
-    time."""
-    attempts: int
-    """Maximum number of attempts at a room."""
-    attempts_per_plan: int
-    """Attempts before a room is planned anew."""
-    whole: int
-    """Attempts in which no object may be left out. Later ones place required objects first, and
-    leave out others without a place; the last one leaves out any."""
-    sound: int
-    """Attempts in which no place may add a fault of function."""
-    together: int
-    """Particles for which attempts are made side by side, if fewer rooms are left; the first
-    successful attempt counts. A step takes about as long for one room as for these."""
-
-
-PLAIN = Effort(particles=1, attempts=48, attempts_per_plan=16, whole=47, sound=0, together=32)
-"""For rooms whose conditions are inputs of the network: a rectangle, and given objects."""
-REQUESTED = Effort(particles=6, attempts=12, attempts_per_plan=1, whole=4, sound=3, together=1)
-"""For rooms with a floor, openings or wishes, which places are checked against."""
 
 
 class SampledRooms(NamedTuple):

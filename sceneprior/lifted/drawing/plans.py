@@ -1,4 +1,5 @@
-"""Plans of rooms, drawn before any object: shape, contents, and looks of given objects."""
+"""Plans of rooms, drawn before any object: shape, contents, and looks of given objects; and the
+effort to furnish them."""
 
 import warnings
 from collections.abc import Sequence
@@ -40,6 +41,32 @@ LOOKS = 16
 SIZE_DOUBT = 0.1
 """Standard deviation of the difference between the log extents of a given object and of its
 look."""
+
+
+class Effort(NamedTuple):
+    """Numbers of particles and attempts at rooms."""
+
+    particles: int
+    """Particles of a room. With more, an attempt meets rarer wishes, in proportionally more
+    time."""
+    attempts: int
+    """Maximum number of attempts at a room."""
+    attempts_per_plan: int
+    """Attempts before a room is planned anew."""
+    whole: int
+    """Attempts in which no object may be left out. Later ones place required objects first, and
+    leave out others without a place; the last one leaves out any."""
+    sound: int
+    """Attempts in which no place may add a fault of function."""
+    together: int
+    """Particles for which attempts are made side by side, if fewer rooms are left; the first
+    successful attempt counts. A step takes about as long for one room as for these."""
+
+
+PLAIN = Effort(particles=1, attempts=48, attempts_per_plan=16, whole=47, sound=0, together=32)
+"""For rooms whose conditions are inputs of the network: a rectangle, and given objects."""
+REQUESTED = Effort(particles=6, attempts=12, attempts_per_plan=1, whole=4, sound=3, together=1)
+"""For rooms with a floor, openings or wishes, which places are checked against."""
 
 
 class RoomPlans(NamedTuple):

@@ -6,9 +6,9 @@ from rooms_of_boxes import sampler_rooms, small_sampler
 from torch.testing import assert_close
 
 from sceneprior.lifted.drawing import draw as module
-from sceneprior.lifted.drawing.draw import PLAIN, SampledRooms, draw_rooms
+from sceneprior.lifted.drawing.draw import SampledRooms, draw_rooms
 from sceneprior.lifted.drawing.overlaps import INTERSECTING
-from sceneprior.lifted.drawing.plans import BEYOND_M
+from sceneprior.lifted.drawing.plans import BEYOND_M, PLAIN
 from sceneprior.lifted.prototypes import POSES, PosedRooms
 from sceneprior.lifted.requests.floors import Floor, read_floor
 from sceneprior.lifted.requests.wishes import Conditions, CountWish, Wishes
