@@ -69,11 +69,12 @@ def sample_rooms(
                 trained, names, seed, request, classes, completes, with_models, rows.start
             )
         except UnknownClassError as error:
-            if not (others := priors_that_draw(error.label)):
+            if not (shipped := priors_that_draw(error.label)):
                 raise
             raise InputError(
                 f"'{error.label}' is not a class of this prior; shipped priors that draw it: "
-                f"{', '.join(others)} (--run {others[0]}). This one draws {', '.join(error.known)}."
+                f"{', '.join(shipped)} (--run {shipped[0]}). This one draws "
+                f"{', '.join(error.known)}."
             ) from None
     if request is not None or classes is not None:
         others = "these rooms come from latents"

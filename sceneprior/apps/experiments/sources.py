@@ -59,13 +59,14 @@ def compare_sources(
             "SHARDS, or only result files, such as scores.json."
         )
     if rooms and against is not None and count is None:
-        folders = [found for source in rooms if (found := _scenes_in(Path(source)))]
+        folders = [many for source in rooms if (many := _scenes_in(Path(source)))]
         count = min(folders) if folders else sum(1 for _ in iterate_rooms(against, "train"))
     for source, title in titles.items():
         if source not in rooms:
             hint = "write it with `sceneprior evaluate`"
             results[title] = read_scores(Path(source), hint)
             continue
+        assert count is not None  # since there are rooms, and shards
         if _scenes_in(Path(source)):
             found = evaluate_folder(Path(source), count, options, against, UseOptions())
         else:
