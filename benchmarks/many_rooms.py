@@ -102,8 +102,8 @@ def main() -> None:
         for count in (1, 2):
             with tempfile.TemporaryDirectory() as name:
                 found |= measure(way, count, arguments.run, arguments.rooms, Path(name))
-    print(json.dumps(machine()))
-    report(found, arguments.json)
+            print(json.dumps(machine()))
+            report(found, arguments.json)
 
 
 if __name__ == "__main__":
