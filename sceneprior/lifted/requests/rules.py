@@ -48,6 +48,9 @@ BEFORE_WINDOW_M = 0.4
 BEFORE_WINDOWS = ("lamp", "plant")
 """Words in the names of classes that may stand or hang in front of a window."""
 
+ALIKE = 0.15
+"""Share by which the extents of two nightstands of a bed may differ."""
+
 FAULTS = (
     "pairs_at_bed", "chairs_at_tables", "chairs_turned", "screens_seen", "fronts_free",
     "backs_covered",
@@ -163,7 +166,10 @@ class PlacementRules:
         beds = rows_of(pieces, BEDS)
         if len(beds) == 1:
             bed = pieces[beds[0]]
-            for row in rows_of(pieces, NIGHTSTANDS):
+            stands = rows_of(pieces, NIGHTSTANDS)
+            if len(stands) == 2 and not _alike(*(pieces[row] for row in stands)):
+                failed.add(("as large as the other", tuple(stands)))
+            for row in stands:
                 place = end_of_bed(bed, pieces[row])
                 if place is None or place[0] not in heads(bed):
                     failed.add(("beside the head", (row,)))
@@ -220,6 +226,12 @@ def backed_by_walls(
     gaps_m = np.abs(((middles_m - sides_m) * inward).sum(axis=1))
     at_wall = shapely.distance(shapely.points(middles_m), shape.floor.polygon.exterior) <= WALL_M
     return np.asarray((gaps_m > FLUSH_M) | at_wall)
+
+
+def _alike(one: Piece, other: Piece) -> bool:
+    """True if no extent of a piece exceeds that of the other by more than `ALIKE`."""
+    ratios = np.array(one.size_m) / np.array(other.size_m)
+    return bool(np.abs(np.log(ratios)).max() <= np.log(1 + ALIKE))
 
 
 def _turned_apart(one: Piece, other: Piece) -> bool:

@@ -132,3 +132,6 @@ def test_a_wardrobe_leaves_paths_to_its_front_and_to_both_sides_of_a_bed(wardrob
     assert (("path to the front", (0,)) in failed) == bool(closed)
     turned = room._replace(front=np.array([front, (0, -1), (0, -1), (0, 1)], float))
     assert rules.faults(turned) - failed == {("turned as the bed", (3,))}
+    low = room._replace(boxes_m=room.boxes_m.copy())
+    low.boxes_m[3, [1, 4]] -= 0.05, 0.1
+    assert rules.faults(low) - failed == {("as large as the other", (2, 3))}
