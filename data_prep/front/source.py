@@ -104,16 +104,16 @@ class FrontSource:
             split_of_id = seeded_split(room_ids, self.seed, val_share=0.1)
         else:
             split_of_id = read_splits(self.splits)
-        tasks = []
+        rooms_to_draw = []
         for room_id, house, views in found:
             bare = room_id.removeprefix(f"{house}_")
             split = split_of_id.get(room_id, split_of_id.get(bare, ""))
             if split in SPLITS:
-                tasks.append(RoomTask(room_id, house, split, views))
+                rooms_to_draw.append(RoomTask(room_id, house, split, views))
             else:
                 left_out.append(Line(room_id, house, "filtered", "split", "it is in no split"))
         where = f"{self.front} passes the recipe {self.recipe.name}"
-        survey = Survey(tuple(tasks), tuple(left_out))
+        survey = Survey(tuple(rooms_to_draw), tuple(left_out))
         return select(survey, self.only, where, str(self.splits or ""))
 
     def prepare(self, task: RoomTask, renderer: Renderer | None) -> PreparedRoom | Line:

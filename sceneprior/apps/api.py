@@ -80,9 +80,9 @@ class Prior:
     def __reduce__(self) -> tuple[Any, ...]:
         return _loaded, (self.where,)  # each worker reads the weights itself, once
 
-    def _drawn(self, given: tuple[Any, ...], then: Then | None, **told: Any) -> list[Scene]:
+    def _drawn(self, given: dict[str, Any], then: Then | None, **told: Any) -> list[Scene]:
         """Rooms of `sample_rooms`, drawn in tasks of `BATCH` rooms."""
-        count = given[0]
+        count = given["count"]
         # Other methods draw all their rooms at once.
         size = BATCH if isinstance(self.trained, TrainedPrior) else max(count, 1)
         blocks = [range(count)[first : first + size] for first in range(0, count, size)]
@@ -165,7 +165,10 @@ class Prior:
             "objects": objects,
         }  # fmt: skip
         models, request = _models(objects or ()) if cad else None, request_of(asked)
-        given = (count, seed, distribution, request, False, None, models)
+        given = {
+            "count": count, "seed": seed, "distribution": distribution, "request": request,
+            "with_models": models,
+        }  # fmt: skip
         return self._drawn(given, then, seed=seed, distribution=distribution or self.distribution)
 
     def interpolate(self, start: Point, end: Point, steps: int = 9) -> list[Scene]:
@@ -239,7 +242,11 @@ class Prior:
             own |= {"ceiling_m": scene.ceiling_m}
         request = request_of({**own, **asked})
         models = _models(scene.objects) if cad else None
-        return self._drawn((count, seed, None, request, True, classes, models), then, seed=seed)
+        given = {
+            "count": count, "seed": seed, "request": request, "completes": True,
+            "classes": classes, "with_models": models,
+        }  # fmt: skip
+        return self._drawn(given, then, seed=seed)
 
     def reconstruct(
         self, images: Sequence[ObservedImage], fit: str = "objects", restarts: int = 1
@@ -302,9 +309,9 @@ def _loaded(where: str) -> Prior:
 
 
 def _draw(
-    prior: Prior, given: tuple[Any, ...], rows: range, then: Then | None, told: dict[str, Any]
+    prior: Prior, given: dict[str, Any], rows: range, then: Then | None, told: dict[str, Any]
 ) -> list[Scene]:
-    rooms = prior._told(sample_rooms(prior.trained, *given, rows), **told)
+    rooms = prior._told(sample_rooms(prior.trained, rows=rows, **given), **told)
     return rooms if then is None else then(rooms, rows.start)
 
 

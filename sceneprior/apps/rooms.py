@@ -1,6 +1,7 @@
 """Write rooms to a folder: scene files, an overview picture and latents."""
 
 import contextlib
+import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -73,19 +74,30 @@ def write_scenes(scenes: Sequence[Scene], folder: Path, shell: ShellName = "none
 def writing_scenes(
     folder: Path, shell: ShellName = "none", with_meshes: bool = False
 ) -> Iterator[tuple[Callable[[list[Scene], int], list[Scene]], list[Scene]]]:
-    """Replace the scenes of a folder, many at a time; its overview and latents are written last.
+    """Replace the scenes of a folder, many at a time, once all are written: the old ones stay if
+    no room is found. Its overview and latents are written last.
 
     Yields:
         A function for `then` of `Prior.sample`, which writes the rooms, and returns all of them
         `with_meshes` or else those of the overview; and an empty list, for what `sample` returns.
     """
-    clear_scenes(folder)
-    scenes: list[Scene] = []
+    folder, scenes = Path(folder), list[Scene]()
+    new, was_there = folder / ".new", folder.exists()
+    shutil.rmtree(new, ignore_errors=True)  # left by a process that was killed
+    new.mkdir(parents=True)
     kept = sys.maxsize if with_meshes else OVERVIEW_ROOMS
-    yield partial(_write_some, folder=Path(folder), shell=shell, kept=kept), scenes
-    sheet = overview(scenes, shell)
-    write_whole(Path(folder) / "overview.png", png_bytes(sheet))
-    write_latents(folder, scenes)
+    try:
+        yield partial(_write_some, folder=new, shell=shell, kept=kept), scenes
+        write_whole(new / "overview.png", png_bytes(overview(scenes, shell)))
+        write_latents(new, scenes)
+        clear_scenes(folder)
+        for path in new.iterdir():
+            path.replace(folder / path.name)
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
+        if not was_there:
+            with contextlib.suppress(OSError):  # it holds the new rooms
+                folder.rmdir()
 
 
 def _write_some(

@@ -228,7 +228,8 @@ def _completed(
                 deaths[name] = _DEATHS  # Dask blames all tasks that a dead worker held
                 todo.appendleft(name)
             else:
-                yield name, error or future.result()
+                outcome: Any = error or future.result()
+                yield name, outcome
         if broken or lost:
             lost += pending.values()
             pending.clear()
@@ -293,7 +294,6 @@ _thread = ThreadPoolExecutor(1)
 def _run_there(folder: Path, call: bytes) -> "_Answer":
     """Run a task in the folder of the command, and in the only thread for tasks: a worker may have
     several, but a GL context and our caches belong to one."""
-
     check_shared(folder)
     os.chdir(folder)
     return _thread.submit(_run_pickled, call).result()

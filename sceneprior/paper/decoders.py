@@ -37,7 +37,7 @@ class JointHead(nn.Sequential):
             nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, classes + 7)
         )
 
-    def forward(
+    def forward(  # type: ignore[override]
         self,
         shared: Float[Tensor, "rooms objects hidden"],
         features: Float[Tensor, "rooms objects width"],

@@ -109,8 +109,7 @@ class LiftedDataset(RoomDataset):
         tasks = {}
         for path in dict.fromkeys(paths):
             own = [given for given, found in zip(inputs, paths, strict=True) if found == path]
-            views = [allowed for *_, allowed in own]
-            tasks[str(path)] = (path, _key_of(own, shape), views, shape)
+            tasks[str(path)] = (path, _key_of(own, shape), [part for *_, part in own], shape)
         whole = folder / f"lifted_{split}.npz"
         found = _cached(
             whole,
