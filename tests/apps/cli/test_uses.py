@@ -33,6 +33,14 @@ def rooms(command, toy_run, tmp_path):
     return tmp_path / "rooms"
 
 
+def test_a_refused_request_keeps_the_old_rooms(command, sampler_run, tmp_path):
+    call = ["synthesize", "--run", sampler_run, "-n", "2", "--out", "made", "--overwrite"]
+    assert command(*call)[0] == 0
+    before = everything_in(tmp_path / "made")
+    assert command(*call, "--floor", "0.5x0.5", "--want", "9 sofas")[0] == 2
+    assert everything_in(tmp_path / "made") == before
+
+
 def test_synthesize_writes_rooms_and_the_same_again(command, toy_run, tmp_path):
     call = ["synthesize", "--run", toy_run, "-n", "3", "--seed", "5", "--shell", "walls"]
     status, out, _ = command(*call, "--out", "made")
