@@ -46,11 +46,11 @@ BUDGET = {
     "sceneprior/render": (4629, 23),
     "sceneprior/training": (1572, 9),
     "sceneprior/paper": (2787, 13),
-    "sceneprior/lifted": (8835, 44),
+    "sceneprior/lifted": (8846, 44),
     "sceneprior/baselines": (2915, 14),
     "sceneprior/evaluation": (4429, 21),
     "sceneprior/interchange": (911, 5),
-    "sceneprior/apps": (7307, 42),
+    "sceneprior/apps": (7326, 42),
 }
 """Most lines and modules of a folder. They go down freely, and up only in a commit that says what
 it bought and what went for it."""
