@@ -50,7 +50,7 @@ BUDGET = {
     "sceneprior/baselines": (2915, 14),
     "sceneprior/evaluation": (4429, 21),
     "sceneprior/interchange": (911, 5),
-    "sceneprior/apps": (7326, 42),
+    "sceneprior/apps": (7325, 42),
 }
 """Most lines and modules of a folder. They go down freely, and up only in a commit that says what
 it bought and what went for it."""

@@ -233,8 +233,7 @@ def priors(
         str | None, typer.Argument(help="Prior whose card to print, as in `synthesize`.")
     ] = None,
 ) -> None:
-    """List the priors that the package ships, with their rooms, classes and scores (95% intervals),
-    or print the card of one prior."""
+    """List the shipped priors with their rooms, classes and scores, or print a prior's card."""
     from sceneprior.apps.priors.listing import listing
     from sceneprior.apps.priors.packed import find_prior, is_packed, read_packed, shipped_priors
 
