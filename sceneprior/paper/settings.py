@@ -81,9 +81,6 @@ class StageConfig(LatentStageConfig):
     schedule: Annotated[Steps | Cosine, Field(discriminator="name")] = Steps()
     latent_epochs: int = Field(0, ge=0)
     """The last of the `epochs` train the latents alone; the released code adds 50 such epochs."""
-    keep_lowest_loss: bool = False
-    """End the stage with the weights of the epoch with the lowest training loss (released code),
-    not with those of the last epoch. Checkpoints are then twice as large."""
     proxy: Literal["ellipsoid", "beveled_box"] = "ellipsoid"
     """Shape from which an object's 2D box is computed where its mesh is not used (see `box_from`),
     in training from views and when rooms are fitted to images. `ellipsoid`: the ellipsoid inscribed

@@ -123,8 +123,6 @@ class PaperStage(LatentStage):
     loss: LossConfig
     static: StaticStep | None = None
     _unchecked: tuple[OnHost, tuple[str, ...]] | None = None
-    _lowest: tuple[float, dict[str, Tensor]] | None = None
-    """Loss and weights of the epoch with the lowest loss, for `keep_lowest_loss`."""
 
     def use_graphs(self, trainer: lightning.Trainer) -> bool:
         """Use CUDA graphs if the settings and the trainer allow; says why not on a GPU."""
@@ -165,22 +163,8 @@ class PaperStage(LatentStage):
             for parameter in self.prior.parameters():
                 parameter.grad = None  # not trained
 
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Remember the weights of the epoch that ends, if its loss is the lowest so far."""
-        if self.stage.keep_lowest_loss and self.trainer.training:
-            loss = float(self.trainer.callback_metrics["train/loss"])  # read by all processes
-            if self._lowest is None or loss < self._lowest[0]:
-                weights = {name: value.clone() for name, value in self.state_dict().items()}
-                self._lowest = loss, weights
-            checkpoint["lowest_loss"] = self._lowest
-
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        self._lowest = checkpoint.get("lowest_loss")
-
     def on_train_end(self) -> None:
         self._check_last()  # training may end within an epoch
-        if self._lowest is not None:
-            self.load_state_dict(self._lowest[1])
 
     def _check_last(self) -> None:
         if self._unchecked is not None:

@@ -152,15 +152,16 @@ class Pictures(Callback):
 
 class RollingCheckpoint(Callback):
     """Write `last.ckpt` after every epoch, the only point at which a run can be resumed exactly;
-    and its copy `best.ckpt` whenever `val/loss` is the least so far.
+    and its copy `best.ckpt` whenever the metric `monitor` is the least so far.
 
     An interrupted run loses the current epoch. The resumed run draws the views of that epoch again,
     and ends at the same weights as an uninterrupted run. The entries of `extra` (plain data) are
     added to every checkpoint.
     """
 
-    def __init__(self, folder: Path, extra: dict):
-        self.folder, self.extra, self.written, self.best = folder, extra, False, math.inf
+    def __init__(self, folder: Path, extra: dict, monitor: str = "val/loss"):
+        self.folder, self.extra, self.monitor = folder, extra, monitor
+        self.written, self.best = False, math.inf
 
     def on_load_checkpoint(self, trainer, pl_module, checkpoint: dict) -> None:
         self.best = float(checkpoint.get("best", math.inf))
@@ -196,7 +197,7 @@ class RollingCheckpoint(Callback):
             trainer.check_val_every_n_epoch = 1
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, pl_module) -> None:
-        loss = float(trainer.callback_metrics.get("val/loss", math.inf))
+        loss = float(trainer.callback_metrics.get(self.monitor, math.inf))
         better, self.best = loss < self.best, min(loss, self.best)
         write_checkpoint(trainer, self.folder, "last.ckpt")
         if better:

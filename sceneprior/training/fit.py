@@ -181,7 +181,8 @@ def _train(
     if previous is None and config.init_from and start is None:
         start_from(Path(config.init_from), module, config.label_set, room_ids)
     said = {"room_ids": room_ids, "label_set": config.label_set, "epochs": settings.epochs}
-    rolling = RollingCheckpoint(folder, {"sceneprior": said})
+    monitor = "train/loss" if settings.keep == "lowest" else "val/loss"
+    rolling = RollingCheckpoint(folder, {"sceneprior": said}, monitor)
     callbacks = [
         RunProgress(f"fit {stage.name} (epochs)"), StepSeed(config.seed), Statistics(),
         Pictures(config, stage, room_ids), rolling, *callbacks,
@@ -239,7 +240,7 @@ def _train(
     finally:
         if "wandb" in loggers:  # otherwise it would log the next stage to the same run
             pkgutil.resolve_name("wandb:finish")()
-    if settings.keep == "best" and rolling.best < math.inf:
+    if settings.keep != "last" and rolling.best < math.inf:
         copy_checkpoint(trainer, folder, "best.ckpt", "final.ckpt")
     else:
         write_checkpoint(trainer, folder, "final.ckpt")

@@ -87,9 +87,10 @@ class TrainConfig(Section):
     small network little, and slows it down much when another program uses that core."""
     val_every: int = Field(20, ge=0)
     """Epochs between validations, and the last is validated, too; 0 for none."""
-    keep: Literal["last", "best"] = "last"
+    keep: Literal["last", "best", "lowest"] = "last"
     """Weights that the next stage and commands take: those of the `last` epoch, or best.ckpt, which
-    is the validated epoch with the least `val/loss`."""
+    is the epoch with the least `val/loss` (`best`) or `train/loss` (`lowest`, as the released code
+    does)."""
 
 
 def without_samples(data: dict[str, Any], source: str) -> dict[str, Any]:

@@ -114,10 +114,10 @@ def test_the_released_codes_numbers():
         "layout.latent_epochs": 50,
         "layout.batch_size": 128,
         "layout.schedule.milestones": [400],
-        "layout.keep_lowest_loss": True,
+        "layout.keep": "lowest",
         "shape.epochs": 550,
         "shape.latent_epochs": 50,
-        "shape.keep_lowest_loss": True,
+        "shape.keep": "lowest",
     }
 
 

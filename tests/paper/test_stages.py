@@ -60,7 +60,7 @@ def test_the_last_epochs_train_the_latents_alone(toy_shards, tmp_path):
 def test_the_weights_of_the_lowest_loss_are_kept_over_a_stop(toy_shards, tmp_path):
     """With too high a rate, the loss of the last epoch is not the lowest."""
     few = {"layout__learning_rate": 0.3, "layout__epochs": 5, "shape__epochs": 1}
-    config = tiny_config(toy_shards, **few, layout__keep_lowest_loss=True)
+    config = tiny_config(toy_shards, **few, layout__keep="lowest")
     interrupted(config, tmp_path / "kept", "layout", 4)
     kept, losses = trained(config, tmp_path / "kept")
     best = losses.index(min(losses))

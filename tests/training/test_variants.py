@@ -29,7 +29,7 @@ RELEASED = {
     "model__layout_heads": "separate",
     "model__completeness_target": "stop",
     "loss__passing_masks_only": True,
-    "layout__keep_lowest_loss": True,
+    "layout__keep": "lowest",
     "shape__latent_epochs": 1,
 }
 VARIANTS = {
