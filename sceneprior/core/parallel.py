@@ -159,7 +159,7 @@ def run_tasks(
         function: A function of a module that workers import. In a task, `run_tasks` works in the
             task's own process.
         tasks: Arguments by name of the task, for errors.
-        title: Title of a progress bar on stderr; None for no bar.
+        title: Title of a progress bar on stderr, for several tasks; None for no bar.
 
     Raises:
         InputError: tasks failed, or killed every worker that they were given to.
@@ -168,7 +168,7 @@ def run_tasks(
     found: dict[str, _Result] = {}
     failed: dict[str, Exception] = {}
     completed: Iterable[tuple[str, _Answer | Exception]] = _completed(where, function, tasks)
-    if title is not None and tasks:
+    if title is not None and len(tasks) > 1:
         from rich.console import Console
         from rich.progress import track
 
