@@ -14,11 +14,10 @@ def meets(room: dict[str, Any], counts: list[tuple], relations: list[tuple], par
     good = all(least <= named.count(label) <= most for label, least, most in counts)
     for subject, relation, target, count in relations:
         found = 0
-        for one in items:
+        for one in (o for o in items if o["class"] == subject):
             others = [o for o in items if o["class"] == target and o is not one]
             to_room = target is None and _to_room(relation, one, room["floor_m"])
-            fits = to_room or any(_related(relation, one, other) for other in others)
-            found += one["class"] == subject and fits
+            found += to_room or any(_related(relation, one, other) for other in others)
         if relation == "beside" and (subject, target, count) == ("nightstand", "double_bed", 2):
             found = max((_pairs(items, bed) for bed in items if bed["class"] == target), default=0)
         good &= found >= count
