@@ -695,10 +695,10 @@ def scores(folder: Path) -> Entry:
 def result(name: str, folder: Path) -> Entry:
     from made_results import write_comparison, write_new_rooms, write_views
 
-    from sceneprior.apps.experiments import table
+    from sceneprior.apps.experiments import rows, table
     from sceneprior.apps.experiments.comparison import load_comparison, runs_of, variants_of
 
-    table.costs_of = lambda run: {"cpu_s": None, "steps": 1, "parameters": 1}
+    rows.costs_of = lambda run: {"cpu_s": None, "steps": 1, "parameters": 1}
     views = {"task": "single_views", "fits": ["paper"]} if name == "eval-svr" else {}
     comparison = load_comparison(write_comparison(folder, Path("shards"), **views))
     runs = runs_of(comparison, folder / "out")
@@ -709,7 +709,12 @@ def result(name: str, folder: Path) -> Entry:
             else:
                 write_new_rooms(variant.result, k, "paper", remembers=True)
     path = variants_of(comparison, runs[0])[0].result
-    return path, lambda: table.write_tables(comparison, runs, folder)
+
+    def read() -> None:
+        found = [row for run in runs for row in rows.rows_of(comparison, run)]
+        table.write_tables(found, rows.form_of(comparison), folder)
+
+    return path, read
 
 
 FORMATS["result of eval-fid"] = partial(result, "eval-fid")

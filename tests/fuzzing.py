@@ -122,7 +122,7 @@ def _refusal(read: Any) -> str | None:
     signal.alarm(SECONDS)
     try:
         read()
-    except InputError as error:
+    except (InputError, FloatingPointError) as error:  # the loss is no number
         return str(error)
     except Exception as error:
         trace = error.__traceback__
