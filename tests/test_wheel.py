@@ -76,7 +76,7 @@ def test_shipped_configs_are_found_by_name(installed, tmp_path):
 
 
 def test_homes_become_shards_and_the_page_template_is_there(installed, tmp_path):
-    assert len(list(installed.glob("sceneprior/evaluation/*.jinja"))) == 4
+    assert len(list(installed.glob("sceneprior/evaluation/*.jinja"))) == 5
     page = installed / "sceneprior/apps/viewer"
     assert (page / "page.css").is_file() and (page / "map.svg").is_file()
     viewer = installed / "sceneprior/evaluation/model_viewer"
