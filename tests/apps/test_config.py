@@ -99,7 +99,7 @@ def test_the_head_of_a_small_config_names_each_key_that_is_not_the_papers(room):
 
 
 def test_the_released_codes_numbers():
-    """What the code that the authors released has of its own, and nothing else."""
+    """Settings of the released code that differ from those of the paper, and no others."""
     paper, released = settings_of("paper/bedroom.yaml"), settings_of("paper/released.yaml")
     assert {key: released[key] for key in paper if released[key] != paper[key]} == {
         "data.augment_rotations": False,
