@@ -62,6 +62,7 @@ class Scores(BaseModel):
     shuffled: dict[str, Number | None] = {}
     independent: dict[str, Number | None] = {}
     independent_meshes: dict[str, Number | None] = {}
+    shuffled_meshes: dict[str, Number | None] = {}
     intervals: dict[str, dict[str, tuple[Number, Number] | None]]
     relations: list[_Relation] = []
     note: str = ""

@@ -20,6 +20,7 @@ from sceneprior.core.ground_truth import (
 from sceneprior.core.scene import Scene
 from sceneprior.evaluation.features import Drawing, Features, check_inception, file_digest
 from sceneprior.evaluation.metric import (
+    FURNISHED,
     METHOD,
     PICTURED,
     RESAMPLES,
@@ -104,9 +105,9 @@ def evaluate_synthesis(
 
     Returns:
         The metrics of the generated rooms by key, and those of the test rooms as `<key>_test`. The
-        baselines' metrics are under `train_rooms`, `independent`, `independent_meshes` (pictures
-        with real meshes), `shuffled` and `decoded_rooms`. `intervals` is by set of rooms, and
-        `protocol` lists all that the values depend on. docs/evaluation.md defines each metric.
+        baselines' metrics are under `train_rooms`, `independent`, `shuffled`, the values of
+        `FURNISHED` (pictures with real meshes) and `decoded_rooms`. `intervals` is by set of rooms,
+        and `protocol` lists all that the values depend on. docs/evaluation.md defines each metric.
     """
     # The weights are checked first, before hours of drawing.
     if options.inception is not None:
@@ -246,7 +247,7 @@ def _choose_rooms(
 def _draw_rooms(
     rooms: _Rooms, shards: Path, drawing: Drawing, options: EvalOptions
 ) -> dict[str, Features]:
-    """Features of every group's pictures (and of `independent_meshes`), and of boxes if asked for.
+    """Features of every group's pictures (and of those of `FURNISHED`), and of boxes if asked for.
 
     Frechet distances and recall depend on the number of pictures, so as many generated rooms are
     drawn as there are real training rooms.
@@ -262,14 +263,14 @@ def _draw_rooms(
     for group in sorted(set(groups) - set(drawn)):
         drawn[group] = drawing.features(group.replace("_", " "), list, groups[group])
     # Rooms are read again with meshes, so that all training meshes are in memory only here.
-    furnished = independent_rooms(
-        reference_scenes(shards, "train"), len(rooms.train_rows), options.seed, with_meshes=True
-    )
-    drawn["independent_meshes"] = drawing.features("independent, furnished", list, furnished)
-    del furnished
+    real = reference_scenes(shards, "train")
+    for group, rooms_of in (("independent", independent_rooms), ("shuffled", shuffled_rooms)):
+        furnished = rooms_of(real, len(rooms.train_rows), options.seed, with_meshes=True)
+        drawn[FURNISHED[group]] = drawing.features(f"{group}, furnished", list, furnished)
+    del real, furnished
     for group in sorted(groups) if options.boxes else ():
         as_boxes = drawn[group]
-        if group not in ("independent", "shuffled"):  # these are boxes already
+        if group not in FURNISHED:  # these are boxes already
             plain = [scene.without_meshes() for scene in groups[group]]
             as_boxes = drawing.features(f"boxed {group}", list, plain)
         drawn[group] |= {f"{network}_boxes": rows for network, rows in as_boxes.items()}
@@ -292,8 +293,8 @@ def _room_sets(
     pictured = [generated.scenes[row] for row in rows]
     sets["pictured"] = RoomSet(pictured, drawn["generated"], counts(len(rows), len(sets)))
     sets["generated"] = replace(generated, pictures={})
-    pictures = drawn["independent_meshes"]
-    sets["independent_meshes"] = replace(sets["independent"], pictures=pictures)
+    for group, furnished in FURNISHED.items():
+        sets[furnished] = replace(sets[group], pictures=drawn[furnished])
     return sets | {"train_rooms": sets["train"]}
 
 

@@ -51,6 +51,9 @@ def eval_fid(
     resamples: ResamplesOption = 200,
     out: OutOption = None,
     distribution: options.Distribution = None,
+    models: Annotated[
+        Path | None, option(f"CAD models to put in place of all objects: {options.MODELS_HELP}")
+    ] = None,
 ) -> None:
     """Compare generated rooms with test rooms, by the distributions of docs/evaluation.md.
 
@@ -62,7 +65,7 @@ def eval_fid(
     from sceneprior.evaluation.synthesis import EvalOptions
 
     protocol = EvalOptions(seed, inception, alexnet, split, boxes, resamples)
-    _score(run, scenes, count, protocol, shards, out, distribution)
+    _score(run, scenes, count, protocol, shards, out, distribution, models=models)
 
 
 @options.with_request
@@ -127,6 +130,7 @@ def _score(
     distribution: str | None,
     use: "UseOptions | None" = None,
     asked: dict[str, Any] | None = None,
+    models: Path | None = None,
 ) -> None:
     """Score the rooms of a run, or a folder of scenes; with `use`, by metrics of use as well."""
     from sceneprior.apps.experiments.evaluate import evaluate_folder, evaluate_run
@@ -143,10 +147,12 @@ def _score(
             options.result_file(run, out, "scores.json"),
             count or (MEASURED if use else GENERATED),
         )
-        found = evaluate_run(run, count, protocol, shards, distribution, use, asked)
+        found = evaluate_run(run, count, protocol, shards, distribution, use, asked, models)
     elif scenes is not None:
-        if distribution is not None:
-            raise InputError("--distribution belongs to --run; scenes are evaluated as they are.")
+        if (distribution, models) != (None, None):
+            raise InputError(
+                "--distribution and --models belong to --run; scenes are evaluated as they are."
+            )
         if asked:
             raise InputError("Requests belong to --run; scenes are evaluated as they are.")
         if use is None and shards is None:

@@ -164,6 +164,10 @@ def commands_of(
         source += ["--shards", str(shards_of(comparison, run.rooms))]
     for variant in variants_of(comparison, run):
         asked = shared if variant.name is None else [*shared, comparison.option, variant.name]
-        words = [comparison.command, *source, "--out", str(variant.result), *asked]
+        command = comparison.command
+        if variant.cad:  # metrics of pictures only, and boxes are those of the variant without
+            command, models = "eval-fid", comparison.models(shards_of(comparison, run.rooms))
+            asked = [*(word for word in asked if word != "--boxes"), *models]
+        words = [command, *source, "--out", str(variant.result), *asked]
         commands.append(Command(variant.result.stem, words, variant.result, asked))
     return commands

@@ -61,6 +61,10 @@ class _Comparison(Section):
     """Seed of the generated rooms, or of the views to reconstruct, the same for every run."""
     rooms: dict[str, Rooms] = Field(min_length=1)
     methods: dict[str, Method] = Field(min_length=1)
+    cad_models: str | None = None
+    """CAD models of a second row of each method, in which every object is replaced by the most
+    similar one: a folder, as for `retrieve --models`, or `shards` for the CAD models of the
+    training rooms. Null leaves out these rows."""
 
     @field_validator("seeds")
     @classmethod
@@ -81,6 +85,12 @@ class _Comparison(Section):
                     f"methods.{key}.set has '{unlisted[0]}'; expected {EVERY} or one of {known}"
                 )
         return self
+
+    def models(self, shards: Path) -> list[str]:
+        """The option `--models` of the commands that score CAD models."""
+        if self.cad_models is None:
+            return []
+        return ["--models", str(shards) if self.cad_models == OF_SHARDS else self.cad_models]
 
 
 class RoomComparison(_Comparison):
@@ -107,6 +117,8 @@ class RoomComparison(_Comparison):
 
     def shared_options(self, shards: Path, inception: Path | None) -> list[str]:
         """The options that `command` has in all rows of a table."""
+        if self.cad_models is not None:
+            _check_truth(shards, "CAD models are compared by pictures of true rooms")
         count = self.count or sum(1 for _ in iterate_rooms(shards, "train"))
         # Some methods decode meshes, others boxes only; --boxes compares the boxes of all methods.
         words = ["-n", str(count), "--seed", str(self.sampling_seed), "--boxes"]
@@ -127,29 +139,27 @@ class ViewComparison(_Comparison):
     fits: tuple[Literal["objects", "paper"], ...] = Field(("objects",), min_length=1, strict=False)
     """Values of `eval-svr --fit` for runs that keep the latents of training rooms, one row each.
     Other methods reconstruct in their own way."""
-    cad_models: str | None = None
-    """Value of `eval-svr --models`: a folder of CAD models, or `shards` for the CAD models of the
-    training rooms. Null leaves out the rows with CAD models."""
 
     def variants(self, config: RunConfig) -> tuple[str | None, ...]:
         """Values of `option` for a run that keeps the latents of training rooms."""
         return self.fits
 
     def shared_options(self, shards: Path, inception: Path | None) -> list[str]:
-        """The options that `command` has in all rows of a table; InputError if the test rooms have
-        no 3D ground truth."""
-        if not known_in_3d(shards, "test"):
-            raise InputError(
-                f"Single views are compared with true rooms, and the 'test' rooms of {shards} are "
-                "missing or not known in 3D; give shards of prep-front or prep-scannet."
-            )
+        """The options that `command` has in all rows of a table."""
+        _check_truth(shards, "Single views are compared with true rooms")
         words = ["--split", "test", "--views", str(self.views), "--seed", str(self.sampling_seed)]
         if self.count is not None:
             words += ["--limit", str(self.count)]
-        if self.cad_models is not None:
-            models = str(shards) if self.cad_models == OF_SHARDS else self.cad_models
-            words += ["--models", models]
-        return words
+        return words + self.models(shards)
+
+
+def _check_truth(shards: Path, compared: str) -> None:
+    """Raise InputError if the test rooms have no 3D ground truth."""
+    if not known_in_3d(shards, "test"):
+        raise InputError(
+            f"{compared}, and the 'test' rooms of {shards} are missing or not known in 3D; give "
+            "shards of prep-front or prep-scannet."
+        )
 
 
 Comparison = RoomComparison | ViewComparison
@@ -214,6 +224,8 @@ class Variant(NamedTuple):
     """Name of the method in captions."""
     result: Path
     """File of the variant's scores."""
+    cad: bool = False
+    """True if all objects are replaced by CAD models."""
 
 
 def load_comparison(name: str) -> Comparison:
@@ -284,7 +296,8 @@ def variants_of(comparison: Comparison, run: Run) -> list[Variant]:
     """The variants of a run, in the order of their rows.
 
     A run that keeps the latents of training rooms has one variant per distribution or fit; its
-    sampler, if it has one, comes first. Runs of other methods have a single variant.
+    sampler, if it has one, comes first. Runs of other methods have a single variant. With
+    `cad_models`, each variant of new rooms is followed by the same rooms with CAD models.
     """
     title, config = comparison.methods[run.method].title, run.run_config
     names = comparison.variants(config) if config.remembers_rooms else (None,)
@@ -295,8 +308,12 @@ def variants_of(comparison: Comparison, run: Run) -> list[Variant]:
             way = OBJECTS if name in (None, OBJECTS) else FIT
         plain, detail, made_by = made_by_run(config, way)
         row = plain if title is None else ", ".join(filter(None, (title, detail)))
-        file = "scores.json" if not found else f"scores_{name}.json"
-        found.append(Variant(name, row, made_by, run.folder / file))
+        file = run.folder / ("scores.json" if not found else f"scores_{name}.json")
+        found.append(Variant(name, row, made_by, file))
+        # `eval-svr` scores reconstructions with CAD models and without in one result.
+        if comparison.cad_models is not None and isinstance(comparison, RoomComparison):
+            cad = file.with_stem(f"{file.stem}_cad")
+            found.append(Variant(name, f"{row}, with CAD models", made_by, cad, cad=True))
     return found
 
 

@@ -9,6 +9,8 @@ import numpy as np
 import torch
 
 from sceneprior.apps.api import load
+from sceneprior.apps.retrieval.cad_models import open_models
+from sceneprior.apps.retrieval.retrieve import retrieve_all
 from sceneprior.core.classes import label_set
 from sceneprior.core.dataset import ViewDataset
 from sceneprior.core.errors import InputError
@@ -56,6 +58,7 @@ def evaluate_run(
     distribution: str | None = None,
     use: UseOptions | None = None,
     asked: dict[str, Any] | None = None,
+    models: Path | None = None,
 ) -> dict[str, Any]:
     """Score generated rooms against test rooms (`scores_of`).
 
@@ -64,6 +67,8 @@ def evaluate_run(
     Args:
         use: Also compute metrics of use; without shards, compute only these.
         asked: Request for the rooms, as arguments of `Prior.sample`; only with `use`.
+        models: CAD models that replace all objects of the rooms (apps/retrieval). Decoded training
+            rooms, which would keep their own meshes, are left out then.
     """
     prior = load(run)
     trained, own = prior.trained, Path(prior.trained.config.data.shards)
@@ -74,8 +79,13 @@ def evaluate_run(
             f"{run} was trained on shards '{own}', which do not exist; name the shards to compare "
             "with: --shards."
         )
-    generate = partial(prior.sample, count, options.seed, distribution, **(asked or {}))
-    scores = scores_of(generate, shards, options, use, trained)
+    sample = partial(prior.sample, count, options.seed, distribution, **(asked or {}))
+    if models is None:
+        scores = scores_of(sample, shards, options, use, trained)
+    else:
+        bank = open_models(models, prior.label_set)
+        scores = scores_of(lambda: [*retrieve_all(sample(), bank)], shards, options, use)
+        scores["protocol"]["models"] = models.resolve().name
     latents = "its own"
     if isinstance(trained, TrainedPrior):
         latents = marked(distribution or trained.distribution)

@@ -46,6 +46,8 @@ UNRANKED = (REFERENCE, GROUPS[DECODED_ROOMS], GROUPS["kernel"])
 """Groups that take no part in the ranking."""
 SHAPES = {"fit": "as found", "fit_cad": "CAD models"}
 """Rows of an `eval-svr` result that the table shows, with their values in the column `shapes`."""
+OF_SCENES = {metric.key for metric in (*METRICS, *USE) if metric.network is None}
+"""Metrics that read classes, boxes and meshes instead of pictures."""
 COSTS = {
     "steps": TableColumn("steps", 0),
     "cpu_s": TableColumn("CPU min", 1),
@@ -126,8 +128,13 @@ def _rows_of_rooms(
         (variant, scores["protocol"]["latents"].split(",")[0], scores)
         for variant, scores in found.items()
     ]
-    first, last = rows[0][2], rows[-1][0]
+    first, last = rows[0][2], [variant for variant, *_ in rows if not variant.cad][-1]
     rows = [(variant, origin, of_set(scores, "generated")) for variant, origin, scores in rows]
+    for variant, _, scores in rows:
+        if variant.cad:  # CAD models change pictures; boxes and layouts are those of the row above
+            for values in (scores, scores["intervals"]):
+                for key in OF_SCENES & values.keys():
+                    del values[key]
     if first.get("decoded_rooms"):
         # The last variant decodes latents; a sampler, which decodes no room, would come first.
         rows.append((last, DECODED_ROOMS, of_set(first, "decoded_rooms")))
@@ -234,6 +241,7 @@ NEW_ROOMS = Form(
         "Independent objects, as boxes": "independent",
         "Independent objects, with meshes": "independent_meshes",
         "Shuffled furniture, as boxes": "shuffled",
+        "Shuffled furniture, with meshes": "shuffled_meshes",
         "Real training rooms": "train_rooms",
         "Real test rooms": "test",
     },

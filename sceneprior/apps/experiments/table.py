@@ -98,11 +98,15 @@ def table_of(rows: Sequence[Row], form: Form) -> Table:
         for key, column in (form.columns | COSTS).items()
         if any(key in row.scores for row in rows)
     }
-    first = rows[0].scores
-    references = [
-        Line(title, GAP, REFERENCE, [first[name]])
+    # The first result may be older than a set of rooms that later ones have.
+    found = {
+        title: next((row.scores[name] for row in rows if name in row.scores), {})
         for title, name in form.references.items()
-        if any(first.get(name, {}).get(key) is not None for key in columns)
+    }
+    references = [
+        Line(title, GAP, REFERENCE, [scores])
+        for title, scores in found.items()
+        if any(scores.get(key) is not None for key in columns)
     ]
     lines = [
         Line(runs[0].title, runs[0].variant, runs[0].group, [row.scores for row in runs])

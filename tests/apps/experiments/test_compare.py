@@ -10,14 +10,18 @@ import torch
 from made_results import write_comparison, write_new_rooms
 from refusals import refused
 
+from sceneprior.apps.api import Prior
 from sceneprior.apps.cli.commands import app
 from sceneprior.apps.config import load_any_run
 from sceneprior.apps.experiments import commands, rows
 from sceneprior.apps.experiments.compare import Compared, commands_of, compare, part_of
 from sceneprior.apps.experiments.comparison import load_comparison, runs_of
 from sceneprior.apps.experiments.rows import costs_of, rows_of
+from sceneprior.apps.retrieval.cad_models import open_models
+from sceneprior.apps.retrieval.retrieve import retrieve_all
 from sceneprior.core.errors import ConfigError, InputError
 from sceneprior.core.files import write_json
+from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
 from sceneprior.paper.fit_image import SCHEDULES, FitSchedule
 
 MAIN = partial(app, standalone_mode=False)
@@ -55,9 +59,11 @@ def test_a_wrong_comparison_is_refused_before_anything_runs(written, tmp_path, n
         load_comparison(path)
 
 
-def test_rooms_without_a_truth_are_refused_before_anything_is_trained(bare, tmp_path):
-    comparison = load_comparison(write_comparison(tmp_path, bare, task="single_views"))
-    with refused("apps/compare_blind", tmp=tmp_path):
+@pytest.mark.parametrize("task", ["single_views", "new_rooms"])
+def test_rooms_without_a_truth_are_refused_before_anything_is_trained(bare, tmp_path, task):
+    path = write_comparison(tmp_path, bare, task=task, cad_models="shards")
+    comparison = load_comparison(path)
+    with refused(f"apps/compare_blind_{task}", tmp=tmp_path):
         compare(comparison, runs_of(comparison, tmp_path / "out"), tmp_path / "out", MAIN)
     assert not (tmp_path / "out" / "toy").exists()
 
@@ -156,6 +162,41 @@ def test_finished_commands_are_not_repeated_and_stay_in_the_table(begun, tmp_pat
     calls.arguments, calls.error = [], None
     again(begun, tmp_path)
     assert calls.names == ["fit", "evaluate", "evaluate"]
+
+
+def test_a_run_of_before_gains_a_row_with_cad_models_and_nothing_else(begun, toy_shards, tmp_path):
+    """Finished commands of a comparison without `cad_models` stay, and so do their rows."""
+    before = again(begun, tmp_path, distributions=["paper"]).table.read_text()
+
+    def titles(table):
+        return [line.split(" |")[0] for line in table.splitlines() if line.startswith("| ")]
+
+    options = EvalOptions(resamples=0)
+    sample = Prior(load_any_run(tmp_path / "out/toy/paper/seed3/run"), "run").sample
+    rooms = list(retrieve_all(sample(4, 0, "paper"), open_models(toy_shards, "front3d_bedroom")))
+    by_hand = evaluate_synthesis(rooms, toy_shards, options)
+    names = []
+
+    def counted(words):
+        names.append(words[0])
+        return MAIN(words)
+
+    comparison = load_comparison(begun(distributions=["paper"], cad_models="shards"))
+    run, out = runs_of(comparison, tmp_path / "out")[0], tmp_path / "out"
+    table = compare(comparison, [run], out, counted).table.read_text()
+    assert names == ["eval-fid"]
+    plain, cad, *_ = rows_of(comparison, run)
+    assert cad.title == "Paper's method, with CAD models" and plain.rank == cad.rank
+    assert cad.scores["protocol"]["models"] == toy_shards.name
+    for key in ("fd_effnet_lite0", "recall_effnet_lite0", "sca_effnet_lite0"):
+        assert cad.scores[key] == pytest.approx(by_hand[key]) and key in cad.scores["intervals"]
+    # Boxes and layouts are those of the first row.
+    assert not {"category_kl", "layout_classifier_accuracy", "fd_effnet_lite0_boxes"} & {
+        *cad.scores, *cad.scores["intervals"]
+    }  # fmt: skip
+    # The older result has no shuffled rooms with meshes; the new one has.
+    more = ["| Shuffled furniture, with meshes", f"| {cad.title}"]
+    assert [line for line in titles(table) if line not in titles(before)] == more
 
 
 def test_a_part_that_is_evaluated_otherwise_names_the_rows_it_leaves_out(begun, tmp_path, calls):
