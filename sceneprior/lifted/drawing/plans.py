@@ -239,13 +239,14 @@ def _with_looks(
     still = torch.cat([rooms.object_class[:, :known], upcoming], dim=1)
     uniform = torch.from_numpy(np.stack([own.random((known, 1 + LOOKS)) for own in draws])).float()
     assert rooms.looks is not None
+    offers = sampler.offers()
     for step in range(known):
         number = torch.full((count,), step)
         state = read_rooms(sampler, rooms, number, rectangle_m, still[:, step:])
         label = rooms.object_class[:, step]
         centre_m, size_m = rooms.boxes_m[:, step].split(3, dim=-1)
         off = size_m.log().unsqueeze(1) - sampler.look_shown[: sampler.looks, -3:]
-        logits = sampler.look_logits(state, label)
+        logits = sampler.look_logits(state, label, offers)
         logits = logits - off.square().sum(dim=-1) / (2 * SIZE_DOUBT**2)
         some = draw_index(logits.unsqueeze(1).expand(-1, LOOKS, -1), uniform[:, step, 1:])
         bottom_m = centre_m[:, 1] - size_m[:, 1] / 2

@@ -60,7 +60,7 @@ class Particles:
         self.room = torch.arange(len(plans.shapes)).repeat_interleave(each)
         self.rooms = plans.rooms.changed(lambda part: part[self.room])
         assert self.rooms.looks is not None
-        self.looks = self.rooms.looks
+        self.looks, self.offers = self.rooms.looks, sampler.offers()
         self.number = self.rooms.is_object.sum(dim=1)
         """Objects placed so far."""
         self.alive = torch.ones_like(self.number, dtype=torch.bool)
@@ -216,7 +216,7 @@ class _Step:
         self.state = read_rooms(
             sampler, before, particles.number[rows], plans.rectangle_m[self.room], self.upcoming
         )
-        self.logits = sampler.look_logits(self.state, self.label)
+        self.logits = sampler.look_logits(self.state, self.label, particles.offers)
         self._furniture = [] if particles.rules is None else particles.furniture()
         self._faults: dict[int, set[Any]] = {}
 

@@ -16,9 +16,9 @@ END = 0
 FEW = 5
 """Number of training rooms in which two independent classes must be expected together, for none to
 mean that rooms have one or the other."""
-MANY = 3
+MANY = 8
 """Number of bits ("at least 1", "at least 2" and so on) that encode the count of a class, besides
-the count itself: the first object of a class is more informative than the next ones."""
+the count itself: tables have two, four or six chairs, and a desk makes it an odd number."""
 RELATIONS = 4
 """Number of features of the relation of a direction to an object already placed: its back points
 in the same direction, in the opposite one, or sideways; and the logarithm of the ratio of its

@@ -151,8 +151,7 @@ class RoomSampler(nn.Module):
         self.register_buffer("sizes_m", torch.ones(prototypes, SIZES, 3))
         self.register_buffer("bottoms_m", torch.zeros(prototypes, SIZES))
         self.register_buffer("size_counts", torch.zeros(prototypes, SIZES))
-        # Contents and places overfit first: they get twice the dropout, at most 0.5.
-        self.contents = Contents(classes, width // 2, min(2 * dropout, 0.5))
+        self.contents = Contents(classes, width, dropout)
         self.class_embedding = nn.Embedding(classes, CLASS_WIDTH)
         self.look_embedding = nn.Linear(SHOWN, width)
         self.object_embedding = nn.Linear(CLASS_WIDTH + 10 * LENGTHS, width)
@@ -173,6 +172,7 @@ class RoomSampler(nn.Module):
         self.frequency = nn.Parameter(torch.zeros(prototypes, POSES))
         self.look_scores = PairwisePotentials(classes)
         self.extents_head = _head(known + width, width, EXTENTS * 7)
+        # Places overfit first: they get twice the dropout, at most 0.5.
         self.placement = Placement(classes, min(2 * dropout, 0.5))
 
     @property
@@ -237,15 +237,22 @@ class RoomSampler(nn.Module):
         features = self.norm(features)
         return EncoderState(before, rectangle_m, symmetry, coming, features[:, 0])
 
+    def offers(self) -> Float[Tensor, "looks match"]:
+        """Keys of all looks, which the steps of a room share."""
+        offered: Tensor = self.offered_look(self.look_shown[: self.looks])
+        return offered
+
     def look_logits(
-        self, state: EncoderState, label: Int[Tensor, " rooms"]
+        self,
+        state: EncoderState,
+        label: Int[Tensor, " rooms"],
+        offers: Float[Tensor, "looks match"],
     ) -> Float[Tensor, "rooms looks"]:
         """Logits of the next object's look, given its class; looks of other classes are ruled
         out."""
         known = torch.cat([state.context, self.class_embedding(label)], dim=-1)
         shown = self.look_shown[: self.looks]
-        offered = self.offered_look(shown)
-        logits = self.wanted_look(known) @ offered.T / math.sqrt(MATCH_WIDTH)
+        logits = self.wanted_look(known) @ offers.T / math.sqrt(MATCH_WIDTH)
         own_pose = OWN_POSE.to(self.frequency.device)
         frequency = self.frequency[:, own_pose].transpose(0, 1).flatten(1)[:, : self.looks]
         logits = logits + frequency[state.symmetry]
@@ -305,7 +312,7 @@ class RoomSampler(nn.Module):
         return self.contents.before(rooms.object_class, rooms.is_object)[:, -1]
 
     def log_prob(
-        self, state: EncoderState, coming: PosedRooms
+        self, state: EncoderState, coming: PosedRooms, offers: Float[Tensor, "looks match"]
     ) -> dict[str, Float[Tensor, " rooms"]]:
         """Log-probabilities of the look, size and place of each room's next object, given its
         class. Every room of `coming` has one object."""
@@ -313,7 +320,7 @@ class RoomSampler(nn.Module):
         label, look = coming.object_class[:, 0], coming.looks[:, 0]
         centre_m, size_m = coming.boxes_m[:, 0].split(3, dim=-1)
         bottom_m = centre_m[:, 1] - size_m[:, 1] / 2
-        looks = self.look_logits(state, label).log_softmax(dim=-1)
+        looks = self.look_logits(state, label, offers).log_softmax(dim=-1)
         # The distribution of the log extents, relative to those of the look.
         known = [state.context, self.class_embedding(label)]
         known.append(self.look_embedding(self.look_shown[look]))

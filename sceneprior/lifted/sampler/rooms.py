@@ -189,15 +189,22 @@ def shuffled(rooms: PosedRooms, generator: torch.Generator) -> PosedRooms:
 
 
 def large_first(
-    object_class: Int[Tensor, "rooms objects"],
+    rooms: PosedRooms,
     footprints_m2: Float[Tensor, " classes"],
     uniform: Float[Tensor, "rooms objects"],
 ) -> Int[Tensor, "rooms objects"]:
-    """A random order in which classes with large footprints tend to come first; padding comes last.
+    """A random order in which classes with large footprints tend to come first, and large objects
+    of a class before its small ones; padding comes last.
 
-    Now and then, a class comes before one with up to exp(`LOOSELY`) times its footprint, so that
-    the network also learns from rooms in which only small objects are given. `uniform` holds random
-    numbers in [0, 1).
+    Now and then, a class or an object comes before one with up to exp(`LOOSELY`) times its
+    footprint, so that the network also learns from rooms in which only small objects are given.
+    `uniform` holds random numbers in [0, 1).
     """
-    tickets = LOOSELY * uniform - footprints_m2.log()[object_class]
-    return tickets.masked_fill(object_class == 0, torch.inf).argsort(dim=1)
+    label, late = rooms.object_class, LOOSELY * uniform
+    tickets = late - footprints_m2.log()[label]
+    order = tickets.masked_fill(label == 0, torch.inf).argsort(dim=1)
+    by_size = (late - rooms.boxes_m[..., [3, 5]].log().sum(dim=-1)).argsort(dim=1)
+    # Each class has the same places in the order, which its objects take by size.
+    places = label.gather(1, order).argsort(dim=1, stable=True)
+    objects = by_size.gather(1, label.gather(1, by_size).argsort(dim=1, stable=True))
+    return torch.empty_like(order).scatter(1, places, objects)

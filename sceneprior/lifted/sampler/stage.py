@@ -158,7 +158,7 @@ def negative_log_likelihood(
     """
     listed = shuffled(rooms, generator)
     uniform = torch.rand(rooms.is_object.shape, generator=generator).to(rooms.boxes_m)
-    rooms = rooms.take(large_first(rooms.object_class, sampler.footprints_m2, uniform))
+    rooms = rooms.take(large_first(rooms, sampler.footprints_m2, uniform))
     rectangle_m = frames_of(rooms, generator)
     rooms = replace(rooms, walls_m=None)
     tokens = sampler.tokens(rooms, rectangle_m)
@@ -166,7 +166,7 @@ def negative_log_likelihood(
     there = sampler.contents.before(rooms.object_class, rooms.is_object)
     still = there[:, -1:] - there
     zeros = tokens.new_zeros(len(counts))
-    found = dict.fromkeys(PARTS_OF_OBJECT, zeros)
+    found, offers = dict.fromkeys(PARTS_OF_OBJECT, zeros), sampler.offers()
     # One call per step, on the rooms with that many objects, so that nothing is padded. Rooms
     # without objects are read in the first call, since the encoder rejects an empty batch.
     for step in range(max(int(counts.max()), 1)):
@@ -178,7 +178,7 @@ def negative_log_likelihood(
         going = (counts[row] > step).nonzero()[:, 0]
         row = row[going]
         following = _first(rooms, row, step + 1).take(torch.full((len(row), 1), step).to(row))
-        for name, log_prob in sampler.log_prob(state.rows(going), following).items():
+        for name, log_prob in sampler.log_prob(state.rows(going), following, offers).items():
             found[name] = found[name].index_add(0, row, -log_prob)
     listing = sampler.contents.negative_log_likelihood(
         listed.object_class, listed.is_object, rectangle_m[:, 2:]

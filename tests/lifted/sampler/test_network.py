@@ -62,7 +62,8 @@ def test_likelihoods_are_those_of_one_object_after_the_other(sampler, rooms):
     generator = torch.Generator().manual_seed(4)
     listed = shuffled(whole, generator)
     uniform = torch.rand(whole.is_object.shape, generator=generator).double()
-    mixed = whole.take(large_first(whole.object_class, sampler.footprints_m2, uniform))
+    offers = sampler.offers()
+    mixed = whole.take(large_first(whole, sampler.footprints_m2, uniform))
     frames = frames_of(mixed, generator)
     mixed = replace(mixed, walls_m=None)  # walls are no slots, which are cut below
     classes = len(sampler.may_meet)
@@ -81,7 +82,7 @@ def test_likelihoods_are_those_of_one_object_after_the_other(sampler, rooms):
             following = one.changed(lambda part, step=step: part[:, step : step + 1])
             coming = rest.bincount(minlength=classes)[None].double()
             reading = read(sampler, before, frame, coming, symmetry[row : row + 1])
-            for name, value in sampler.log_prob(reading, following).items():
+            for name, value in sampler.log_prob(reading, following, offers).items():
                 slow[name] -= float(value)
         for name, value in slow.items():
             assert value == pytest.approx(float(fast[name][row]), rel=1e-9), name
@@ -93,14 +94,14 @@ def test_how_often_a_look_comes_turns_with_the_room(sampler, rooms):
     frame = rectangles_of(whole)
     plain = read(sampler, whole, frame)
     label = torch.tensor([1])
-    before = sampler.look_logits(plain, label)
+    before = sampler.look_logits(plain, label, sampler.offers())
     with torch.no_grad():
         sampler.frequency[0, 2] += 3.0
     try:
         for number in range(SYMMETRIES):
             shown = torch.tensor([number])
             reading = plain._replace(symmetry=shown)
-            gain = sampler.look_logits(reading, label) - before
+            gain = sampler.look_logits(reading, label, sampler.offers()) - before
             at = turn_posed(torch.tensor([[2]]), shown % QUARTERS, shown >= QUARTERS)
             likelier = (gain > 1.5) & before.isfinite()
             assert likelier.nonzero()[:, 1].tolist() == at[0].tolist()

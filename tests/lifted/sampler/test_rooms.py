@@ -12,13 +12,14 @@ from torch.testing import assert_close
 from sceneprior.core.boxes import turn_boxes
 from sceneprior.core.wall_lines import Wall
 from sceneprior.lifted.lifting.dataset import LiftedDataset
+from sceneprior.lifted.prototypes import PosedRooms
 from sceneprior.lifted.sampler.frames import (
     SYMMETRIES,
     rectangle_sides,
     rectangles_of,
     turned_rooms,
 )
-from sceneprior.lifted.sampler.rooms import SamplerRooms, frames_of
+from sceneprior.lifted.sampler.rooms import LOOSELY, SamplerRooms, frames_of, large_first
 
 
 @pytest.fixture(scope="module")
@@ -68,6 +69,29 @@ def test_rectangles_end_at_walls_near_the_furniture():
         assert high[0] > x2 and high[1] > z2
         plain = frames_of(replace(rooms, walls_m=None), torch.Generator().manual_seed(seed))
         assert torch.equal(frames[1:], plain[1:])
+
+
+def test_large_classes_and_large_objects_of_a_class_come_first(torch_rng):
+    """As a plain loop orders them: classes by their footprints, then each one's objects."""
+    label = torch.tensor([[1, 2, 2, 1, 2, 0], [2, 1, 0, 0, 0, 0], [0] * 6])
+    footprints_m2 = torch.tensor([1.0, 0.2, 0.7])
+    boxes_m = torch.rand(3, 6, 6) + 0.1
+    uniform = torch.rand(3, 6)
+    rooms = PosedRooms(label, label > 0, boxes_m * (label > 0)[..., None])
+    found = large_first(rooms, footprints_m2, uniform)
+    for row in range(3):
+        there = [item for item in range(6) if label[row, item]]
+        late = (LOOSELY * uniform[row]).tolist()
+        x, z = boxes_m[row, :, 3].log().tolist(), boxes_m[row, :, 5].log().tolist()
+        means = footprints_m2.log()[label[row]].tolist()
+        classes = [int(label[row, k]) for k in sorted(there, key=lambda k: late[k] - means[k])]
+        by_size = sorted(there, key=lambda k: late[k] - x[k] - z[k])
+        left = {name: [k for k in by_size if label[row, k] == name] for name in (1, 2)}
+        assert found[row, : len(there)].tolist() == [left[name].pop(0) for name in classes]
+        assert sorted(found[row].tolist()) == list(range(6))
+    uniform[:] = 0.5  # nothing comes late
+    plain = rooms.take(large_first(rooms, footprints_m2, uniform))
+    assert plain.object_class.tolist() == [[2, 2, 2, 1, 1, 0], [2, 1, 0, 0, 0, 0], [0] * 6]
 
 
 @pytest.mark.parametrize("symmetry", range(SYMMETRIES))
