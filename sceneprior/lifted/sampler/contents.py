@@ -132,9 +132,9 @@ class PairwisePotentials(nn.Module):
     class or pair of classes, which a few hundred rooms suffice to learn.
 
     Chairs at a table point in the same direction or in opposite ones, towards its long sides; they
-    have the same shape; and a table with four chairs is large. The encoder does not learn this: it
-    sees a look as a coarse grid of its shape, in which it recognises neither the back nor that two
-    objects have the same prototype.
+    have the same shape; and a table with four chairs is large, the next table is not. The encoder
+    does not learn this: it sees a look as a coarse grid of its shape, in which it recognises
+    neither the back nor that two objects have the same prototype.
 
     Args:
         classes: Size of the label set.
@@ -144,13 +144,13 @@ class PairwisePotentials(nn.Module):
         super().__init__()
         self.direction_table = nn.Parameter(torch.zeros(classes, classes, RELATIONS))
         self.repeat_table = nn.Parameter(torch.zeros(classes))
-        self.size_table = nn.Parameter(torch.zeros(classes, classes, MANY, MEASURES))
+        self.size_table = nn.Parameter(torch.zeros(classes, 2 * classes, MANY, MEASURES))
 
     def forward(
         self,
         label: Int[Tensor, " rooms"],
         before: PosedRooms,
-        counts: Float[Tensor, "rooms classes"],
+        counts: Float[Tensor, "rooms twice_classes"],
         look_shown: Float[Tensor, "looks shown"],
         backs: Int[Tensor, " prototypes"],
     ) -> Float[Tensor, "rooms looks"]:
@@ -158,7 +158,7 @@ class PairwisePotentials(nn.Module):
 
         Args:
             before: The objects already placed.
-            counts: Number of objects of each class, placed and still to come.
+            counts: Number of objects of each class, placed or still to come, then of those placed.
             look_shown: Encoding of every look; it ends with the logarithms of the extents.
             backs: Side of every prototype's back; see `side_of`.
         """

@@ -256,7 +256,8 @@ class RoomSampler(nn.Module):
         own_pose = OWN_POSE.to(self.frequency.device)
         frequency = self.frequency[:, own_pose].transpose(0, 1).flatten(1)[:, : self.looks]
         logits = logits + frequency[state.symmetry]
-        counts = self.counts(state.before) + state.coming
+        placed = self.counts(state.before)
+        counts = torch.cat([placed + state.coming, placed], dim=-1)
         logits = logits + self.look_scores(label, state.before, counts, shown, self.backs)
         others = self.look_class[: self.looks] != label.unsqueeze(-1)
         return logits.masked_fill(others, -torch.inf)

@@ -44,6 +44,7 @@ def rooms() -> PosedRooms:
 
 LABEL = torch.tensor([1, 2, 3, 1])
 COUNTS = torch.tensor([[0, 1, 2, 4], [0, 0, 1, 3], [0, 0, 0, 1], [0, 1, 0, 0]]).double()
+COUNTS = torch.cat([COUNTS, (COUNTS - 1).clamp(min=0)], dim=1)  # then those placed
 
 
 def look_shown() -> torch.Tensor:
@@ -76,7 +77,7 @@ def test_scores_are_those_of_a_plain_loop(scores, rooms):
                 repeats |= other == label and int(known) // POSES == look // POSES
             total += float(scores.repeat_table[label]) * repeats
             x, _, z = look_shown()[look, -3:].tolist()
-            for other in range(CLASSES):
+            for other in range(2 * CLASSES):
                 for times in range(1, MANY + 1):
                     if COUNTS[row, other] >= times:
                         area, ratio = scores.size_table[label, other, times - 1].tolist()
