@@ -48,9 +48,9 @@ BUDGET = {
     "sceneprior/paper": (2768, 13),
     "sceneprior/lifted": (8862, 44),
     "sceneprior/baselines": (2915, 14),
-    "sceneprior/evaluation": (4432, 21),
+    "sceneprior/evaluation": (4436, 21),
     "sceneprior/interchange": (911, 5),
-    "sceneprior/apps": (7374, 42),
+    "sceneprior/apps": (7372, 42),
 }
 """Most lines and modules of a folder. They go down freely, and up only in a commit that says what
 it bought and what went for it."""

@@ -20,7 +20,6 @@ from sceneprior.core.ground_truth import (
 from sceneprior.core.scene import Scene
 from sceneprior.evaluation.features import Drawing, Features, check_inception, file_digest
 from sceneprior.evaluation.metric import (
-    FURNISHED,
     METHOD,
     PICTURED,
     RESAMPLES,
@@ -51,6 +50,8 @@ NOTE = (
     "Measured on the rooms of these shards. Shards of `sceneprior make-homes` hold synthetic "
     "homes: their scores cannot be compared with the paper's, which are on 3D-FRONT."
 )
+BASELINES = {"independent": independent_rooms, "shuffled": shuffled_rooms}
+"""Functions that make the rooms of the baselines, which are drawn as boxes and with meshes."""
 
 _PACKAGES = (
     "sceneprior", "torch", "numpy", "scipy", "scikit-learn", "shapely", "trimesh", "numba",
@@ -105,8 +106,8 @@ def evaluate_synthesis(
 
     Returns:
         The metrics of the generated rooms by key, and those of the test rooms as `<key>_test`. The
-        baselines' metrics are under `train_rooms`, `independent`, `shuffled`, the values of
-        `FURNISHED` (pictures with real meshes) and `decoded_rooms`. `intervals` is by set of rooms,
+        baselines' metrics are under `train_rooms`, `independent`, `shuffled`, both again with
+        `_meshes` (pictures with real meshes) and `decoded_rooms`. `intervals` is by set of rooms,
         and `protocol` lists all that the values depend on. docs/evaluation.md defines each metric.
     """
     # The weights are checked first, before hours of drawing.
@@ -235,8 +236,7 @@ def _choose_rooms(
                 f"Scoring needs at least 2 {group} rooms, but there are {len(scenes)}; synthesize "
                 "or prepare more."
             )
-    groups["independent"] = independent_rooms(train, len(rows), seed)
-    groups["shuffled"] = shuffled_rooms(train, len(rows), seed)
+    groups |= {group: rooms_of(train, len(rows), seed) for group, rooms_of in BASELINES.items()}
     if len(decoded) > 1:
         chosen = seeded_rows(len(decoded), len(rows), seed)
         groups["decoded_rooms"] = [decoded[row] for row in chosen]
@@ -247,7 +247,8 @@ def _choose_rooms(
 def _draw_rooms(
     rooms: _Rooms, shards: Path, drawing: Drawing, options: EvalOptions
 ) -> dict[str, Features]:
-    """Features of every group's pictures (and of those of `FURNISHED`), and of boxes if asked for.
+    """Features of every group's pictures, of the groups of `BASELINES` with real meshes as well,
+    and of boxes if asked for.
 
     Frechet distances and recall depend on the number of pictures, so as many generated rooms are
     drawn as there are real training rooms.
@@ -264,13 +265,13 @@ def _draw_rooms(
         drawn[group] = drawing.features(group.replace("_", " "), list, groups[group])
     # Rooms are read again with meshes, so that all training meshes are in memory only here.
     real = reference_scenes(shards, "train")
-    for group, rooms_of in (("independent", independent_rooms), ("shuffled", shuffled_rooms)):
+    for group, rooms_of in BASELINES.items():
         furnished = rooms_of(real, len(rooms.train_rows), options.seed, with_meshes=True)
-        drawn[FURNISHED[group]] = drawing.features(f"{group}, furnished", list, furnished)
+        drawn[f"{group}_meshes"] = drawing.features(f"{group}, furnished", list, furnished)
     del real, furnished
     for group in sorted(groups) if options.boxes else ():
         as_boxes = drawn[group]
-        if group not in FURNISHED:  # these are boxes already
+        if group not in BASELINES:  # these are boxes already
             plain = [scene.without_meshes() for scene in groups[group]]
             as_boxes = drawing.features(f"boxed {group}", list, plain)
         drawn[group] |= {f"{network}_boxes": rows for network, rows in as_boxes.items()}
@@ -293,7 +294,8 @@ def _room_sets(
     pictured = [generated.scenes[row] for row in rows]
     sets["pictured"] = RoomSet(pictured, drawn["generated"], counts(len(rows), len(sets)))
     sets["generated"] = replace(generated, pictures={})
-    for group, furnished in FURNISHED.items():
+    for group in BASELINES:
+        furnished = f"{group}_meshes"
         sets[furnished] = replace(sets[group], pictures=drawn[furnished])
     return sets | {"train_rooms": sets["train"]}
 

@@ -49,7 +49,7 @@ class PrototypeConfig(ShapeModuleConfig):
     coarser, and more often repeated."""
     codes: int = Field(128, ge=1)
     """Dimension of the shape code; similar looks (`lifted/prototypes.py`) have nearby codes. A
-    larger one tells more looks apart."""
+    larger one can distinguish more looks."""
     width: int = Field(128, ge=8)
     """Hidden width of the MLP that predicts the code."""
     cells: int = Field(32, ge=8, le=64)

@@ -30,7 +30,7 @@ class LossConfig(Section):
     at 0, objects may extend behind others without limit."""
     iou_gate: float = Field(0.5, ge=0, lt=1)
     """Masks enter L_S (Eq. 8) only if their IoU with the observed mask is above this value. At 0,
-    all that overlap do, wrong matches included."""
+    all masks that overlap enter it, even those of wrong matches."""
     passing_masks_only: bool = False
     """Average L_S over the pairs of masks that pass the gate, as in the released code. If false,
     the others count as 0 (Eq. 8). It has no effect when rooms are fitted to images."""
@@ -80,16 +80,16 @@ class StageConfig(LatentStageConfig):
 
     schedule: Annotated[Steps | Cosine, Field(discriminator="name")] = Steps()
     latent_epochs: int = Field(0, ge=0)
-    """The last of the `epochs` train the latents alone; the released code adds 50 such epochs."""
+    """Epochs at the end, part of `epochs`, that train the latents alone; released code: 50 more."""
     proxy: Literal["ellipsoid", "beveled_box"] = "ellipsoid"
     """Shape from which an object's 2D box is computed where its mesh is not used (see `box_from`),
     in training from views and when rooms are fitted to images. `ellipsoid`: the ellipsoid inscribed
     in the 3D box, in closed form. `beveled_box`: the 3D box with its edges cut off by the learnt
     bevels of the class."""
     cuda_graphs: bool = True
-    """On a single GPU, launch what has the same shape in every batch as CUDA graphs (`StaticStep`),
-    without a gradient averaged over batches. Then a loss that is not finite is found one step
-    later. It changes the last bits of sums, and nothing on a CPU."""
+    """On a single GPU, run the parts of a step whose shapes never change as CUDA graphs
+    (`StaticStep`), unless `accumulate` is above 1. A loss that is not finite is then noticed one
+    step later, and the last bits of sums differ. It has no effect on a CPU."""
 
 
 class LayoutConfig(StageConfig):

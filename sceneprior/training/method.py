@@ -79,14 +79,14 @@ class TrainConfig(Section):
     batch_size: int = Field(16, ge=1)
     """Rooms per batch and process. A larger batch gives fewer, smoother updates per epoch."""
     accumulate: int = Field(1, ge=1)
-    """Batches whose gradients are averaged before each update: larger batches without memory."""
+    """Batches whose gradients are averaged before each update, which takes no more memory."""
     clip_gradient: float = Field(0.0, ge=0)
     """Norm to which gradients are clipped, against jumps of the loss; 0 turns clipping off."""
     cpu_threads: int | None = Field(None, ge=1)
     """Torch threads on a CPU; None is 1. A second one changes the last bits of weights, speeds up a
     small network little, and slows it down much when another program uses that core."""
     val_every: int = Field(20, ge=0)
-    """Epochs between validations, and the last is validated, too; 0 for none."""
+    """Epochs between validations, besides one after the last epoch; 0 turns validation off."""
     keep: Literal["last", "best", "lowest"] = "last"
     """Weights that the next stage and commands take: those of the `last` epoch, or best.ckpt, which
     is the epoch with the least `val/loss` (`best`) or `train/loss` (`lowest`, as the released code
@@ -137,8 +137,8 @@ class RunConfig(Section, ABC):
     """Seed of initial weights and latents, of batches, views, noise and dropout."""
     data: DataConfig
     init_from: str | None = None
-    """Run folder or checkpoint with whose weights the first stage starts, in place of random ones;
-    another label set's classes are found by their names, and rooms' latents by their ids."""
+    """Run folder or checkpoint whose weights replace the random ones at the start of the first
+    stage. Classes of another label set are matched by name, and latents by the ids of rooms."""
     trainer: dict[str, Any] = Field({})
     """Arguments of Lightning's Trainer that no section of a stage sets, such as {max_steps: 9}."""
     callbacks: tuple[dict[str, dict[str, Any] | None], ...] = Field((), strict=False)

@@ -170,19 +170,17 @@ TASKS: dict[str, type[Comparison]] = {"new_rooms": RoomComparison, "single_views
 # -- Runs and rows ---------------------------------------------------------------------------------
 
 PAPER, LIFTED = "the paper's method and variations of it", "the lifted method"
-LIFTED_BOXES = "the paper's network and latents trained on lifted boxes"
+LIFTED_TARGETS = "the paper's network on lifted targets"
 GIVEN = "scenes as given, which were made elsewhere"
 LATENTS, FIT = "latents", "fit"
 ROWS = {
     (LATENTS, False): ("Paper's method", "", PAPER),
-    (LATENTS, True): (
-        "Paper's sphere, trained on lifted boxes", "trained on lifted boxes", LIFTED_BOXES,
-    ),
+    (LATENTS, True): ("Paper's network on lifted targets", "on lifted targets", LIFTED_TARGETS),
     (SAMPLER, True): ("Lifted method: sampler", "sampler of the lifted method", LIFTED),
     (FIT, False): ("Paper: fit of a latent", "fit of a latent", PAPER),
     (FIT, True): (
-        "Fit of a latent, trained on lifted boxes", "fit of a latent, trained on lifted boxes",
-        LIFTED_BOXES,
+        "Fit of a latent, paper's network on lifted targets", "fit of a latent, on lifted targets",
+        LIFTED_TARGETS,
     ),
     (OBJECTS, False): ("Object by object, by the paper's prior", "object by object", LIFTED),
     (OBJECTS, True): ("Object by object", "object by object", LIFTED),

@@ -1,4 +1,4 @@
-"""Tables as Markdown, CSV and a page that sorts, from rows: best values, and those near them."""
+"""Tables of rows as Markdown, CSV and an HTML page with sortable columns; marks of best values."""
 
 import csv
 import io
