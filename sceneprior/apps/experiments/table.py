@@ -99,7 +99,7 @@ def table_of(rows: Sequence[Row], form: Form) -> Table:
         if any(key in row.scores for row in rows)
     }
     # The first result may be older than a set of rooms that later ones have.
-    found = {
+    found: dict[str, Result] = {
         title: next((row.scores[name] for row in rows if name in row.scores), {})
         for title, name in form.references.items()
     }
