@@ -46,7 +46,7 @@ BUDGET = {
     "sceneprior/render": (4629, 23),
     "sceneprior/training": (1575, 9),
     "sceneprior/paper": (2768, 13),
-    "sceneprior/lifted": (8862, 44),
+    "sceneprior/lifted": (8886, 44),
     "sceneprior/baselines": (2915, 14),
     "sceneprior/evaluation": (4436, 21),
     "sceneprior/interchange": (911, 5),

@@ -216,7 +216,9 @@ class _Step:
         self.state = read_rooms(
             sampler, before, particles.number[rows], plans.rectangle_m[self.room], self.upcoming
         )
-        self.logits = sampler.look_logits(self.state, self.label, particles.offers)
+        logits = sampler.look_logits(self.state, self.label, particles.offers)
+        fewer = logits.masked_fill(sampler.excluded_looks(before), -torch.inf)
+        self.logits = fewer.where(fewer.isfinite().any(dim=1, keepdim=True), logits)
         self._furniture = [] if particles.rules is None else particles.furniture()
         self._faults: dict[int, set[Any]] = {}
 

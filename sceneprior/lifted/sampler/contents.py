@@ -14,8 +14,8 @@ from sceneprior.lifted.sampler.frames import side_of
 END = 0
 """Class that ends a room's list: void, which no listed object has."""
 FEW = 5
-"""Number of training rooms in which two independent classes must be expected together, for none to
-mean that rooms have one or the other."""
+"""Number of training rooms in which two independent classes, or looks, must be expected together,
+for none to mean that rooms have one or the other."""
 MANY = 8
 """Number of bits ("at least 1", "at least 2" and so on) that encode the count of a class, besides
 the count itself: tables have two, four or six chairs, and a desk makes it an odd number."""
@@ -65,9 +65,7 @@ class Contents(nn.Module):
         """Set the buffers from the numbers of each class in the training rooms."""
         self.most.copy_(counts.amax(dim=0))
         self.most[END] = 1
-        here = (counts > 0).to(counts)
-        each, together = here.sum(dim=0), here.T @ here
-        self.excluded.copy_((together == 0) & (each * each[:, None] > FEW * len(counts)))
+        self.excluded.copy_(exclusive(counts))
 
     def forward(
         self, counts: Float[Tensor, "*batch classes"], extents_m: Float[Tensor, "*batch 2"]
@@ -125,6 +123,15 @@ class Contents(nn.Module):
             drawn[:, slot] = label * going
             counts = counts.scatter_add(1, label[:, None], going[:, None].to(counts))
         return drawn
+
+
+def exclusive(counts: Float[Tensor, "rooms kinds"]) -> Bool[Tensor, "kinds kinds"]:
+    """Pairs of kinds of objects that no room has together, and would have if they were independent;
+    a pair of a kind with itself is two objects of it. `counts` are the objects of each kind."""
+    here = (counts > 0).to(counts)
+    each, together = here.sum(dim=0), here.T @ here
+    together.fill_diagonal_(0).diagonal().add_((counts > 1).sum(dim=0))
+    return (together == 0) & (each * each[:, None] > FEW * len(counts))
 
 
 class PairwisePotentials(nn.Module):

@@ -5,7 +5,7 @@ import math
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
@@ -124,6 +124,8 @@ class RoomSampler(nn.Module):
     rectangle_means: Tensor
     rectangle_factors: Tensor
     may_meet: Tensor
+    exclusive: Tensor
+    """Pairs of prototypes that no room has together, such as two dining tables; see `exclusive`."""
     footprints_m2: Tensor
     backs: Tensor
     fronts: Tensor
@@ -144,6 +146,7 @@ class RoomSampler(nn.Module):
         self.register_buffer("rectangle_means", torch.zeros(RECTANGLES, 4))
         self.register_buffer("rectangle_factors", torch.zeros(RECTANGLES, 4, 4))
         self.register_buffer("may_meet", torch.zeros(classes, classes, dtype=torch.bool))
+        self.register_buffer("exclusive", torch.zeros(prototypes, prototypes, dtype=torch.bool))
         self.register_buffer("footprints_m2", torch.ones(classes))
         self.register_buffer("backs", torch.zeros(prototypes, dtype=torch.int64))
         self.register_buffer("fronts", torch.zeros(prototypes, dtype=torch.int64))
@@ -261,6 +264,12 @@ class RoomSampler(nn.Module):
         logits = logits + self.look_scores(label, state.before, counts, shown, self.backs)
         others = self.look_class[: self.looks] != label.unsqueeze(-1)
         return logits.masked_fill(others, -torch.inf)
+
+    def excluded_looks(self, before: PosedRooms) -> Bool[Tensor, "rooms looks"]:
+        """Looks of prototypes that no room has together with one that is there."""
+        assert before.looks is not None
+        barred = self.exclusive[before.looks // POSES] & before.is_object.unsqueeze(-1)
+        return barred.any(dim=1).repeat_interleave(POSES, dim=1)[:, : self.looks]
 
     def draw_size(
         self, look: Int[Tensor, " rooms"], before: PosedRooms, uniform: Float[Tensor, " rooms"]

@@ -1,5 +1,6 @@
 """Statistics of the training rooms that a sampler is given before it is trained: rectangles, pairs
-of classes that may intersect, and the backs, fronts, sizes and heights of prototypes.
+of classes that may intersect, exclusive prototypes, and the backs, fronts, sizes and heights of
+prototypes.
 
 Real furniture repeats a limited number of models, and lifted boxes of the same model differ by a
 few per cent. Objects of one prototype with similar extents are one entry of its list of sizes, with
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from sceneprior.core.boxes import QUARTERS
 from sceneprior.lifted.prototypes import POSES, PosedRooms, Prototypes
+from sceneprior.lifted.sampler.contents import exclusive
 from sceneprior.lifted.sampler.network import RECTANGLES, SIZES, RoomSampler
 from sceneprior.lifted.sampler.rooms import SamplerRooms, frames_of
 
@@ -35,7 +37,8 @@ squared."""
 def teach(sampler: RoomSampler, rooms: SamplerRooms) -> None:
     """Set the buffers of a fresh sampler from the training rooms: the encodings of looks, the
     mixture of rectangles, the classes that may be sampled, the pairs of classes that may intersect,
-    mean footprints, and the sizes, heights, backs and fronts of prototypes."""
+    exclusive prototypes, mean footprints, and the sizes, heights, backs and fronts of prototypes.
+    """
     prototypes = rooms.prototypes
     looks = torch.from_numpy(prototypes.shown())
     sampler.look_shown[: len(looks)] = looks
@@ -43,7 +46,10 @@ def teach(sampler: RoomSampler, rooms: SamplerRooms) -> None:
     sampler.look_class[: len(looks)] = labels.repeat_interleave(POSES)
     sampler.contents.teach(sampler.counts(rooms.rooms))
     sampler.may_meet.copy_(rooms.may_meet(len(sampler.may_meet)))
-    here = rooms.rooms.is_object
+    here, posed = rooms.rooms.is_object, rooms.rooms.looks
+    assert posed is not None
+    counts = torch.zeros(len(posed), len(sampler.exclusive))
+    sampler.exclusive.copy_(exclusive(counts.scatter_add_(1, posed // POSES, here.float())))
     areas_m2 = rooms.rooms.boxes_m[here][:, [3, 5]].prod(dim=-1)
     labels = rooms.rooms.object_class[here]
     sampler.footprints_m2.scatter_reduce_(0, labels, areas_m2, "mean", include_self=False)

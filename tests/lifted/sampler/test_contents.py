@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from sceneprior.lifted.sampler.contents import END, Contents
+from sceneprior.lifted.sampler.contents import END, Contents, exclusive
 
 CLASSES, SLOTS = 5, 4
 
@@ -65,3 +65,14 @@ def test_no_room_has_more_of_a_class_or_of_rivals_than_training_rooms(contents):
         there, torch.full((2000,), 9), size_m, uniform, torch.tensor([9.0] * 4 + [0])
     )
     assert not (asked == 4).any(), "at most none is asked for"
+
+
+def test_kinds_that_no_room_has_together_exclude_each_other():
+    """Kinds 0 and 1 could not be apart by luck; kind 2 is too rare to say, and of kind 3 there are
+    two in a room."""
+    counts = torch.zeros(40, 4)
+    counts[:20, 0], counts[20:, 1], counts[0, 2], counts[::2, 3] = 1, 1, 1, 2
+    found = exclusive(counts)
+    expected = torch.zeros(4, 4, dtype=torch.bool)
+    expected[0, 1] = expected[1, 0] = expected[0, 0] = expected[1, 1] = True
+    assert torch.equal(found, expected)
