@@ -35,7 +35,7 @@ from sceneprior.training.callbacks import (
     write_checkpoint,
 )
 from sceneprior.training.method import RunConfig, Stage, read_checkpoint, without_samples
-from sceneprior.training.start_from import start_from
+from sceneprior.training.start_from import find_source, start_from
 from sceneprior.training.steps import make_loader
 from sceneprior.training.trainer import LOGGERS, make_trainer, trainer_arguments, usage_errors
 from sceneprior.training.validation import val_loaders
@@ -62,6 +62,8 @@ def fit(
         trainer_options: Arguments of Lightning's Trainer, before those of the section `trainer`.
         callbacks: Lightning's callbacks for every stage, called after those of `fit`.
     """
+    if config.init_from and not resume:
+        find_source(Path(config.init_from))  # before the shards are opened
     run, config = Path(run), config.with_label_set()
     for name in loggers:
         if name not in LOGGERS:

@@ -12,6 +12,14 @@ from sceneprior.core.errors import InputError
 from sceneprior.training.method import read_checkpoint
 
 
+def find_source(source: Path) -> Path:
+    """The checkpoint, or the run's newest one; an `InputError` if there is none."""
+    finals = [*source.glob("*/final.ckpt")] or [*source.glob("*/last.ckpt")]
+    if not (source.is_file() or finals):
+        raise InputError(f"init_from: {source} is neither a checkpoint nor a run with one.")
+    return source if source.is_file() else max(finals, key=lambda each: each.stat().st_mtime)
+
+
 def start_from(source: Path, module: nn.Module, labels: str, room_ids: Sequence[str]) -> None:
     """Copy the weights of a checkpoint, or of a run's newest one, to a module that was just built.
 
@@ -19,10 +27,7 @@ def start_from(source: Path, module: nn.Module, labels: str, room_ids: Sequence[
     latents by the rooms' ids; other rows keep their initial values. An `InputError` says if there
     is no checkpoint, or if it is of another network.
     """
-    finals = [*source.glob("*/final.ckpt")] or [*source.glob("*/last.ckpt")]
-    if not (source.is_file() or finals):
-        raise InputError(f"init_from: {source} is neither a checkpoint nor a run with one.")
-    path = source if source.is_file() else max(finals, key=lambda each: each.stat().st_mtime)
+    path = find_source(source)
     saved = read_checkpoint(path)
     said = saved.get("sceneprior", {})
     mine, theirs = label_set(labels), label_set(said.get("label_set", labels))

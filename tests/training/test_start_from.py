@@ -82,7 +82,7 @@ def test_classes_are_found_by_name_and_latents_by_room(toy_shards, tmp_path, hea
         start_from(path, small, config.label_set, [])
     with refused("training/init_from classes", tmp=tmp_path):
         start_from(path, small, mine, [])
-    without = tiny_config(toy_shards, init_from=str(tmp_path / "no"))
+    without = tiny_config(tmp_path / "no shards", init_from=str(tmp_path / "no"))
     with refused("training/init_from nothing", tmp=tmp_path):
         fit(without, tmp_path / "run", False, (), CPU)
     assert not (tmp_path / "run").exists()
