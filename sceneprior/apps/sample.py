@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from sceneprior.apps.priors.packed import priors_that_draw
-from sceneprior.core.classes import UnknownClassError, label_set
+from sceneprior.core.classes import UnknownClassError
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
 from sceneprior.core.repeatable import check_seed, single_threaded
-from sceneprior.core.scene import Scene, SceneObject
-from sceneprior.core.views import RoomBoxes
+from sceneprior.core.scene import Scene
 from sceneprior.lifted.drawing.draw import sample_scenes
 from sceneprior.lifted.requests.request import RequestFile, RoomRequest
 from sceneprior.lifted.trained import SAMPLER, TrainedLifted
@@ -94,28 +93,8 @@ def sample_rooms(
             f"{trained.config.method}` has no latents; leave the option out."
         )
     rooms = trained.prior.sample(count, seed)
-    found = boxes_to_scenes(rooms, trained.config.label_set, names, rows.start)
+    found = rooms.to_scenes(trained.config.label_set, names, rows.start)
     return found if with_models is None else with_models(found)
-
-
-def boxes_to_scenes(
-    rooms: RoomBoxes, label_set_name: str, names: Sequence[str], first: int = 0
-) -> list[Scene]:
-    """Scenes of boxes without meshes, from row `first` on; `extra` holds the objects' yaws, if they
-    are known."""
-    classes = label_set(label_set_name)
-    scenes = []
-    for row, name in enumerate(names, first):
-        real = rooms.is_object[row]
-        labels, boxes = rooms.object_class[row, real].tolist(), rooms.boxes_m[row, real].tolist()
-        objects = tuple(
-            SceneObject(classes[label], tuple(box[:3]), tuple(box[3:]))
-            for label, box in zip(labels, boxes, strict=True)
-        )
-        yaw_rad = rooms.yaw_rad
-        extra = {} if yaw_rad is None else {"yaw_rad": yaw_rad[row, real].tolist()}
-        scenes.append(Scene(name, label_set_name, objects, extra=extra))
-    return scenes
 
 
 def load_request(path: str | Path) -> dict[str, Any]:

@@ -29,6 +29,7 @@ from sceneprior.core.dataset import ViewDataset
 from sceneprior.core.views import DecodedScenes, SceneViews
 from sceneprior.paper.decoders import LayoutDecoder, ShapeDecoderConfig
 from sceneprior.paper.prior import ModelConfig, PriorConfig
+from sceneprior.paper.sampling import example_rooms
 from sceneprior.paper.transformer import TransformerConfig
 from sceneprior.training.method import Stage, TrainConfig
 from sceneprior.training.steps import check_finite, full_precision, log_losses
@@ -132,6 +133,8 @@ class GanStage(lightning.LightningModule):
     weights, in which the oscillation of the two networks cancels. `excess` is the running mean of
     `contents` of generated rooms minus that of real rooms.
     """
+
+    examples = staticmethod(example_rooms)
 
     def __init__(self, config: GanConfig):
         super().__init__()

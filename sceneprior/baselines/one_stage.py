@@ -22,6 +22,7 @@ from torch.nn.utils.rnn import pad_sequence
 from sceneprior.core.boxes import turn_boxes
 from sceneprior.core.dataset import BLANK, RoomDataset
 from sceneprior.core.errors import ShardError
+from sceneprior.core.scene import Scene
 from sceneprior.core.settings import Section
 from sceneprior.core.shards import RoomGroundTruth, Shard
 from sceneprior.core.views import RoomBoxes, SceneViews
@@ -101,6 +102,13 @@ class OneStage(ValidatedModule, ABC):
         check_finite(total, batch.room_ids)
         log_losses(self, losses | logged, total, max(len(batch.room_ids), 1))
         return total
+
+    def examples(self, trained: Any, count: int) -> dict[str, list[Scene]]:
+        """Rooms for pictures, `drawn` by the network if it generates rooms."""
+        if not isinstance(trained, TrainedSampler):
+            return {}
+        names = [f"drawn_{row}" for row in range(count)]
+        return {"drawn": trained.prior.sample(count, 0).to_scenes(trained.config.label_set, names)}
 
     def configure_optimizers(self) -> torch.optim.Optimizer | OptimizerLRSchedulerConfig:
         optimizer = torch.optim.Adam(self.prior.parameters(), lr=self.settings.learning_rate)

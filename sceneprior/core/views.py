@@ -15,9 +15,11 @@ from torch.nn import functional as F
 from torch.nn.utils.rnn import pad_sequence
 
 from sceneprior.core.cameras import camera_centers
+from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.observations import RoomViews, thinned
 from sceneprior.core.repeatable import constants
+from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.shards import iterate_rooms, splits_of
 
 _B = TypeVar("_B", bound="Batch")
@@ -210,6 +212,23 @@ class RoomBoxes(Batch):
             return torch.take_along_dim(tensor, rows, dim=1)
 
         return self.changed(taken)
+
+    def to_scenes(self, label_set_name: str, names: Sequence[str], first: int = 0) -> list[Scene]:
+        """Scenes of boxes without meshes, from row `first` on; `extra` holds the objects' yaws, if
+        they are known."""
+        classes = label_set(label_set_name)
+        scenes = []
+        for row, name in enumerate(names, first):
+            real = self.is_object[row]
+            labels, boxes = self.object_class[row, real].tolist(), self.boxes_m[row, real].tolist()
+            objects = tuple(
+                SceneObject(classes[label], tuple(box[:3]), tuple(box[3:]))
+                for label, box in zip(labels, boxes, strict=True)
+            )
+            yaw_rad = self.yaw_rad
+            extra = {} if yaw_rad is None else {"yaw_rad": yaw_rad[row, real].tolist()}
+            scenes.append(Scene(name, label_set_name, objects, extra=extra))
+        return scenes
 
 
 @dataclass(frozen=True)

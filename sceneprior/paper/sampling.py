@@ -77,6 +77,18 @@ def draw_latents(
     return z
 
 
+def example_rooms(trained: TrainedPrior, count: int) -> dict[str, list[Scene]]:
+    """Rooms for pictures: `decoded` from latents of training rooms, if they have some, and `drawn`
+    from N(0, 1)."""
+    logits = trained.logits[:: max(-(-len(trained.logits) // count), 1)]
+    points = {"decoded": trained.prior.latent_space(logits)} if len(logits) else {}
+    points["drawn"] = draw_latents(trained, count, 0, "paper")
+    return {
+        name: decode_latents(trained, z, [f"{name}_{row}" for row in range(len(z))])
+        for name, z in points.items()
+    }
+
+
 def sample_logits(
     trained: Float[Tensor, "rooms anchors"],
     count: int,

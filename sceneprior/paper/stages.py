@@ -11,12 +11,11 @@ from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
 
 from sceneprior.core.errors import InputWarning
-from sceneprior.core.scene import Scene
 from sceneprior.core.views import DecodedScenes, SceneViews
 from sceneprior.paper.losses import layout_losses, mask_loss, seen_masks
 from sceneprior.paper.matching import Matches, seen_boxes
-from sceneprior.paper.prior import ScenePrior, TrainedPrior
-from sceneprior.paper.sampling import decode_latents, draw_latents
+from sceneprior.paper.prior import ScenePrior
+from sceneprior.paper.sampling import example_rooms
 from sceneprior.paper.settings import (
     LatentStageConfig,
     LayoutConfig,
@@ -43,6 +42,8 @@ class LatentStage(ValidatedModule, ABC):
 
     `config` is the run's, and `stage` its section of this stage.
     """
+
+    examples = staticmethod(example_rooms)
 
     def __init__(
         self, config: Any, stage: LatentStageConfig, prior: ScenePrior, latents: nn.Embedding
@@ -82,16 +83,6 @@ class LatentStage(ValidatedModule, ABC):
         total = weighted_sum(losses, self.loss)
         log_losses(self, losses | beside, total, rooms)
         return total
-
-    def examples(self, trained: TrainedPrior, count: int) -> dict[str, list[Scene]]:
-        """Rooms for pictures: `decoded` from latents of training rooms, `drawn` from N(0, 1)."""
-        logits = trained.logits[:: -(-len(trained.logits) // count)]
-        points = {"decoded": trained.prior.latent_space(logits)}
-        points["drawn"] = draw_latents(trained, count, 0, "paper")
-        return {
-            name: decode_latents(trained, z, [f"{name}_{row}" for row in range(len(z))])
-            for name, z in points.items()
-        }
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         """Adam with the stage's schedule and three learning rates: for the network, for the shape

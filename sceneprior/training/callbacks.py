@@ -38,7 +38,7 @@ _RESUMED = ("epoch", "global_step", "loops", "optimizer_states", "pytorch-lightn
 PICTURED = 4
 """Number of rooms in a picture."""
 DRAWING = 0.02
-"""Share of a stage's time beyond which no more pictures are drawn before its end."""
+"""Share of a stage's time beyond which no more pictures are drawn; one more at most doubles it."""
 
 
 class RunProgress(Callback):
@@ -114,16 +114,16 @@ class Statistics(Callback):
 
 
 class Pictures(Callback):
-    """Draws floor plans of a few rooms for TensorBoard and W&B, every `val_every` epochs within
-    `DRAWING`, and at the end. The stage's module makes the rooms (`examples`)."""
+    """Draws floor plans of a few rooms for TensorBoard and W&B, every `val_every` epochs and at the
+    end, within `DRAWING`. The stage's module makes the rooms (`examples`)."""
 
     def __init__(self, config: RunConfig, stage: Stage, room_ids: Sequence[str]):
         self.config, self.stage, self.room_ids = config, stage, tuple(room_ids)
         self.started_s, self.spent_s, self.drawn_at = time.monotonic(), 0.0, -1
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, pl_module) -> None:
-        every, since_s = self.stage.settings.val_every, time.monotonic() - self.started_s
-        if every and (trainer.current_epoch + 1) % every == 0 and self.spent_s <= DRAWING * since_s:
+        every = self.stage.settings.val_every
+        if every and (trainer.current_epoch + 1) % every == 0:
             self.draw(trainer, pl_module)
 
     def on_train_end(self, trainer: lightning.Trainer, pl_module) -> None:
@@ -137,7 +137,10 @@ class Pictures(Callback):
         make = getattr(pl_module, "examples", None)
         if make is None or not (trainer.is_global_zero and (boards or others)):
             return
-        start_s, self.drawn_at = time.monotonic(), trainer.global_step
+        start_s = time.monotonic()
+        if self.spent_s > DRAWING * (start_s - self.started_s):
+            return
+        self.drawn_at = trainer.global_step
         trained = self.config.trained(pl_module, self.stage.name, self.room_ids)
         with contextlib.suppress(InputError):  # a network of few epochs may draw no valid room
             for name, scenes in make(trained, PICTURED).items():

@@ -1,7 +1,9 @@
 """Validation: what it computes, on which rooms and views, and that training does not notice it."""
 
 import csv
+import math
 import shutil
+import time
 from pathlib import Path
 
 import pytest
@@ -12,6 +14,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tiny_runs import tiny_baseline, tiny_config
 
 from sceneprior.core.errors import InputWarning
+from sceneprior.paper.stages import LatentStage
 from sceneprior.training import callbacks, validation
 from sceneprior.training.fit import fit
 from sceneprior.training.method import read_checkpoint
@@ -62,7 +65,7 @@ def test_training_does_not_notice_its_validation(val_shards, tmp_path, often, mo
     """Every weight has the same bits without, and without pictures, with dropout and steps of the
     latents."""
     runs = {}
-    monkeypatch.setattr(callbacks, "DRAWING", 1.0)
+    monkeypatch.setattr(callbacks, "DRAWING", math.inf)
     for every in (0, 1):
         given = {f"{stage}__val_every": every for stage in ("layout", "shape")}
         given |= {"model__decoder__dropout": 0.2, "layout__latent_noise": 0.1}
@@ -130,11 +133,30 @@ def test_the_best_epoch_is_kept(toy_shards, tmp_path, monkeypatch):
     )
 
 
-@pytest.mark.parametrize("method", ["atiss", "total3d"])
-def test_networks_without_latents_are_validated_on_val_rooms(val_shards, tmp_path, method):
+@pytest.mark.parametrize("method", ["gan", "atiss", "sync2gen", "set_flow", "total3d"])
+def test_baselines_are_validated_on_val_rooms_and_draw_pictures(
+    val_shards, tmp_path, method, monkeypatch
+):
+    monkeypatch.setattr(callbacks, "DRAWING", math.inf)
     config = tiny_baseline(val_shards, method, training__epochs=2, training__val_every=1)
-    fit(config, tmp_path / "run", False, ("csv",), CPU)
-    assert len(curve(tmp_path / "run", method, "val/loss")) == 2
+    fit(config, tmp_path / "run", False, ("csv", "tensorboard"), CPU)
+    assert len(curve(tmp_path / "run", method, "val/loss")) == (0 if method == "gan" else 2)
+    found = {name: len(steps) for name, steps in pictures(tmp_path / "run", method).items()}
+    assert found == ({} if method == "total3d" else {"rooms/drawn": 2})
+
+
+def test_pictures_that_take_too_long_are_drawn_once(toy_shards, tmp_path, monkeypatch):
+    drawn = []
+
+    def slow(trained, count):
+        drawn.append(trained.stage)
+        time.sleep(1)
+        return {}
+
+    monkeypatch.setattr(LatentStage, "examples", staticmethod(slow))
+    given = {"layout__epochs": 3, "layout__val_every": 1, "shape__epochs": 1}
+    fit(tiny_config(toy_shards, **given), tmp_path / "run", False, ("tensorboard",), CPU)
+    assert drawn == ["layout", "shape"]
 
 
 def test_val_rooms_that_do_not_fit_are_named(val_shards, tmp_path):
