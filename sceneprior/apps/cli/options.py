@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from sceneprior.core.shell import ShellName
 
 
+LEFT_OUT = 3
+"""Exit status of a command that did its work but had to leave something out."""
+
+
 def option(told: str, *names: str, **limits: Any) -> Any:
     """A typer option with its help text, and its names if they do not follow from the parameter."""
     return typer.Option(*names, help=told, **limits)
@@ -161,8 +165,9 @@ def rooms_in_words(count: int) -> str:
     return "1 room" if count == 1 else f"{count} rooms"
 
 
-def note_unmet(scenes: Sequence["Scene"]) -> None:
-    """Print how many wishes hold, and those that each room does not fulfil."""
+def note_unmet(scenes: Sequence["Scene"]) -> int:
+    """Print how many wishes hold, and those that each room does not fulfil; the exit status of the
+    command, `LEFT_OUT` if rooms lack something that the request requires."""
     wishes = [each for room in scenes for each in room.extra.get("wishes", [])]
     held = sum(each["holds"] for each in wishes)
     if wishes:
@@ -175,6 +180,10 @@ def note_unmet(scenes: Sequence["Scene"]) -> None:
             typer.echo(f"Note: {room.name} does not fulfil: {', '.join(unmet)}.", err=True)
         if remarks := room.extra.get("remarks"):
             typer.echo(f"Note: in {room.name}, {'; '.join(remarks)}.", err=True)
+    if lacks := [room.extra["lacks"] for room in scenes if "lacks" in room.extra]:
+        said = f"{len(lacks)} of {rooms_in_words(len(scenes))} could not be drawn as requested"
+        typer.echo(f"Note: {said}: {lacks[0]}", err=True)
+    return LEFT_OUT if lacks else 0
 
 
 def result_file(run: str, out: Path | None, name: str) -> Path:

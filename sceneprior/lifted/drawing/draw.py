@@ -12,7 +12,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from sceneprior.core.classes import UnknownClassError, label_set
-from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Mesh, Scene, SceneObject, Solid, quarter_turned
 from sceneprior.core.shell import rectangle
 from sceneprior.lifted.drawing.plans import (
@@ -54,6 +53,8 @@ class SampledRooms(NamedTuple):
     """None for a room of which only the rectangle is known (`PosedRooms.rectangle_m`)."""
     missing: tuple[tuple[int, ...], ...]
     """Classes of required objects that found no place."""
+    lacks: tuple[str, ...]
+    """Why what the conditions require is missing, as a sentence; empty if nothing is."""
 
 
 @torch.no_grad()
@@ -77,11 +78,11 @@ def draw_rooms(
     A seed always draws the same rooms, and the first ones do not depend on `count`.
 
     Args:
-        may_lack: Required objects may be missing from all rooms.
+        may_lack: The floor may be too small for the required objects.
         first: Number of the first room, of those that the seed draws.
 
     Raises:
-        InputError: no room can meet the conditions, or none was found; the message says why.
+        InputError: no room can meet the conditions; the message says why.
     """
     check_floor(sampler, conditions, may_lack)
     effort, rejections = REQUESTED if conditions.has_rules else PLAIN, Rejections()
@@ -122,9 +123,12 @@ def draw_rooms(
             finished |= earliest.keys()
         waiting = [row for row in waiting if row not in finished]
         number = attempts.stop
-    if count and all(missing) and not may_lack:
-        raise InputError(_in_the_way(rejections, missing[0], conditions.classes))
-    return SampledRooms(replace(rooms, rectangle_m=rectangle_m), tuple(shapes), tuple(missing))
+    lacks = tuple(
+        _in_the_way(rejections, own, conditions.classes) if own else shape.lacks if shape else ""
+        for own, shape in zip(missing, shapes, strict=True)
+    )
+    rooms = replace(rooms, rectangle_m=rectangle_m)
+    return SampledRooms(rooms, tuple(shapes), tuple(missing), lacks)
 
 
 def _parts(rooms: PosedRooms) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -175,6 +179,9 @@ def _furnish(
                 particles.alive[rows] = True
                 missing[room] += [int(plans.upcoming[room, step])] * required
     good = particles.alive
+    if number < effort.whole:
+        whole = torch.tensor([shape is None or not shape.lacks for shape in plans.shapes])
+        good = good & whole[particles.room]
     if conditions.floor is None and number < effort.whole:
         added = (plans.upcoming != END).any(dim=1)[particles.room]
         gaps = gaps_m(particles.rooms, plans.rectangle_m[particles.room])
@@ -192,14 +199,13 @@ def _furnish(
 
 
 def _in_the_way(rejections: Rejections, missing: Sequence[int], classes: Sequence[str]) -> str:
-    """The error message for a request that no attempt met."""
+    """The reason why a room lacks a required object."""
     label = missing[0]
     own = Counter({what: times for (index, what), times in rejections.items() if index == label})
     what = own.most_common(1)[0][0] if own else "free floor"
     return (
-        f"No room holds the request: in {REQUESTED.attempts} attempts with {REQUESTED.particles} "
-        f"partial rooms each, a {classes[label].replace('_', ' ')} found no place; most places "
-        f"lacked {what}. Ask for less, or for a larger floor."
+        f"in {REQUESTED.attempts} attempts with {REQUESTED.particles} partial rooms each, a "
+        f"{classes[label].replace('_', ' ')} found no place; most places lacked {what}."
     )
 
 
@@ -216,7 +222,7 @@ def sample_scenes(
     """Sample a room with meshes for each name; see `draw_rooms` (also for `first`).
 
     `extra` of a room lists the rows of the given objects (`given`), the request without them
-    (`request`), and whether each wish holds (`wishes`).
+    (`request`), whether each wish holds (`wishes`), and why required things are missing (`lacks`).
 
     Args:
         classes: Classes of the objects to add to the given ones, and no others; instead of wishes.
@@ -225,7 +231,7 @@ def sample_scenes(
         with_models: Replaces meshes by models; wishes are checked after it.
 
     Raises:
-        InputError: the prior does not understand the request, or no room meets it.
+        InputError: the prior does not understand the request, or no room can meet it.
     """
     sampler, label_names = trained.sampler, label_set(trained.config.label_set)
     assert sampler is not None, "callers ask trained.sampler first"
@@ -253,6 +259,7 @@ def sample_scenes(
             extra["no_place"] = sorted(label_names[index] for index in drawn.missing[row])
         elif told:
             extra = {"request": told, "wishes": []}
+            extra |= {"lacks": drawn.lacks[row]} if drawn.lacks[row] else {}
         if conditions.objects:
             extra["given"] = list(range(len(conditions.objects)))
         scene = _scene_of(trained, name, conditions, drawn, row, with_models is not None)

@@ -14,6 +14,7 @@ from torch.nn import functional as F
 from sceneprior.core.colliders import HUNG
 from sceneprior.core.errors import InputError, InputWarning
 from sceneprior.core.mixtures import draw_index
+from sceneprior.core.scene import Opening
 from sceneprior.core.shell import rectangle
 from sceneprior.lifted.prototypes import PosedRooms
 from sceneprior.lifted.requests.checks import fronts_of
@@ -125,20 +126,28 @@ def plan_rooms(
         choice, *normal = frames.unflatten(1, (RECTANGLES, 5)).unbind(dim=-1)
         noise = torch.special.ndtri(torch.stack(normal, dim=-1).clamp(1e-6, 1 - 1e-6))
         tried_m = sampler.rectangles(choice, noise)
-        needed = torch.cat([known.object_class[known.is_object], required])
-        needed_m2 = float(sampler.footprints_m2[needed].sum()) / FULL_SHARE
+        there = torch.cat([known.object_class[known.is_object], required])
+        needed_m2 = float(sampler.footprints_m2[there].sum()) / FULL_SHARE
         enough_m2 = needed_m2 if len(required) else 0.0
-        rectangle_m = holding(tried_m, rectangles_of(known)[0], enough_m2, bool(conditions.objects))
+        needed = rectangles_of(known)[0], enough_m2, bool(conditions.objects)
+        rectangle_m = holding(tried_m, *needed)
         extents_m, pieces_m = rectangle_m[:, 2:], rectangle_m.unsqueeze(1)
     else:
         rectangle_m, extents_m, pieces_m = (
             torch.from_numpy(part).float().expand(count, *part.shape)
             for part in (floor.rectangle_m, floor.extents_m, floor.rectangles_m)
         )
-    shapes = [
-        _shape(conditions, own_m, own)
-        for own_m, own in zip(rectangle_m.double().numpy(), draws, strict=True)
-    ]
+    shapes = list[RoomShape | None]()
+    for row, own in enumerate(draws):
+        for skipped in range(RECTANGLES):
+            if skipped and floor is None:  # as if those before had not been sampled
+                rectangle_m[row] = holding(tried_m[row : row + 1, skipped:], *needed)[0]
+            shape = _shape(conditions, rectangle_m[row].double().numpy(), own)
+            if shape is None or not shape.lacks:
+                break
+        shapes.append(shape)
+    if floor is not None and shapes and all(shape and shape.lacks for shape in shapes):
+        raise InputError(shapes[0].lacks)
     counts = sampler.counts(known)[0]
     counts = (counts + F.one_hot(required, len(counts)).sum(dim=0)).expand(count, -1)
     free = slots - int(counts[0].sum())
@@ -205,8 +214,13 @@ def _shape(
     if floor is None:
         middle, half = rectangle_m[:2], rectangle_m[2:] / 2
         floor = Floor(rectangle(middle - half, middle + half))
-    openings = place_openings(floor, conditions.openings, draws)
-    return RoomShape(floor, openings, conditions.ceiling_m)
+    wanted, lacks = conditions.openings, ""
+    try:
+        openings = place_openings(floor, wanted, draws)
+    except InputError as error:
+        given, lacks = [each for each in wanted if isinstance(each, Opening)], str(error)
+        openings = place_openings(floor, given, draws)
+    return RoomShape(floor, openings, conditions.ceiling_m, lacks)
 
 
 def read_rooms(

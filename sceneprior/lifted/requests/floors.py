@@ -83,6 +83,8 @@ class RoomShape(NamedTuple):
     floor: Floor
     openings: tuple[Opening, ...] = ()
     ceiling_m: float | None = None
+    lacks: str = ""
+    """Why requested doors or windows are left out, as a sentence."""
 
     def inward(self, opening: Opening) -> Float[np.ndarray, "2"]:
         """Unit normal, into the room, of the wall with this door or window."""

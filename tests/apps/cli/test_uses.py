@@ -12,11 +12,13 @@ import trimesh
 from cli_helpers import everything_in, one_sentence
 from model_folder import corner_sofa, write_models
 
+from sceneprior.apps import api
 from sceneprior.apps.config import load_run
 from sceneprior.apps.priors.packed import shipped_priors
 from sceneprior.apps.rooms import write_scenes
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.interchange.export import FORMATS
+from sceneprior.lifted.drawing import draw
 from sceneprior.paper import sampling
 
 BEDROOM = "front3d_bedroom"
@@ -39,6 +41,27 @@ def test_a_refused_request_keeps_the_old_rooms(command, sampler_run, tmp_path):
     before = everything_in(tmp_path / "made")
     assert command(*call, "--floor", "0.5x0.5", "--want", "9 sofas")[0] == 2
     assert everything_in(tmp_path / "made") == before
+
+
+def test_rooms_that_lack_something_are_kept_and_counted(command, tmp_path, monkeypatch):
+    monkeypatch.setattr(draw, "REQUESTED", draw.REQUESTED._replace(attempts=3, whole=1, sound=1))
+    want = "double_bed: 1, desk: 1, single_bed: 1"
+    call = ["synthesize", "--run", "procthor-bedroom", "-n", 8, "--floor", "2x2.4", "--want", want]
+    found = []
+    for size in (2, 64):  # no room of the first task holds the request
+        monkeypatch.setattr(api, "BATCH", size)
+        status, out, errors = command(*call, "--out", f"by{size}")
+        assert status == 3 and out.endswith(f"Wrote 8 rooms to by{size} (from: sampler)\n")
+        paths = sorted((tmp_path / f"by{size}").glob("*.json"))
+        rooms = [json.loads(path.read_text()) for path in paths]
+        lacks = [room["extra"].pop("lacks", "") for room in rooms]
+        assert len(rooms) == 8 and all(lacks[:2]) and "" in lacks[2:]
+        for room, said in zip(rooms, lacks, strict=True):
+            assert all(each["holds"] for each in room["extra"]["wishes"][:3]) == (not said)
+        said = f"Note: {8 - lacks.count('')} of 8 rooms could not be drawn as requested: {lacks[0]}"
+        assert errors.splitlines()[-1] == said and "bed found no place; most" in said
+        found.append(rooms)
+    assert found[0] == found[1]
 
 
 def test_synthesize_writes_rooms_and_the_same_again(command, toy_run, tmp_path):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import shapely
 
+import sceneprior
 from sceneprior.core.scene import Opening
 from sceneprior.lifted.requests.floors import Floor, RoomShape, read_floor
 from sceneprior.lifted.requests.openings import WantedOpening, place_openings, read_openings
@@ -37,6 +38,12 @@ def test_texts_and_mappings_are_read():
 def test_places_count_from_the_western_or_northern_end(text, line):
     (door,) = placed(text)
     np.testing.assert_allclose(sorted([door.start_m, door.end_m]), line)
+
+
+def test_floors_are_drawn_on_which_doors_and_windows_fit():
+    wanted = "window@north," * 4 + "door@south:3"
+    for room in sceneprior.load("procthor-bedroom").sample(8, 0, openings=wanted):
+        assert len(room.openings) == 5 and all(each["holds"] for each in room.extra["wishes"])
 
 
 def test_drawn_places_lie_in_walls_apart_from_each_other():
