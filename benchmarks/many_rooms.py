@@ -30,6 +30,15 @@ from sceneprior.paper.sampling import BATCH
 from sceneprior.render.scene_files import load_scene_folder
 
 EMPTY_TASKS = 1000
+WAYS = ("processes", 1), ("processes", 2), ("dask", 1), ("dask", 2)
+ROWS = (
+    (f"start and the first {BATCH} rooms a worker, s", "start_s", ".0f"),
+    ("drawn, with files, rooms a second", "drawn_rooms_per_s", ".1f"),
+    ("exported to MuJoCo, rooms a second", "settled_rooms_per_s", ".1f"),
+    ("read, ms a room", "reading_ms_a_room", ".0f"),
+    ("CPU seconds in all", "cpu_s_in_all", ".0f"),
+    ("an empty task, ms", "empty_task_ms", ".2f"),
+)
 
 
 def nothing(number: int) -> int:
@@ -91,6 +100,16 @@ def measure(way: str, count: int, run: str, rooms: int, folder: Path) -> dict[st
     }
 
 
+def print_table(found: dict[str, float]) -> None:
+    """Print the table of docs/cluster.md."""
+    titles = "this process", "2 processes", "Dask, 1 worker", "Dask, 2 workers"
+    print(f"| {found['rooms']} rooms |", " | ".join(titles), "|")
+    print("| ---", *["| ---:"] * len(titles), "|")
+    for title, key, form in ROWS:
+        cells = (format(found[f"{way}_{count}_{key}"], form) for way, count in WAYS)
+        print(f"| {title} |", " | ".join(cells), "|")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rooms", type=int, default=512)
@@ -98,12 +117,12 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     found: dict[str, float] = {"rooms": arguments.rooms}
-    for way in ("processes", "dask"):
-        for count in (1, 2):
-            with tempfile.TemporaryDirectory() as name:
-                found |= measure(way, count, arguments.run, arguments.rooms, Path(name))
-            print(json.dumps(machine()))
-            report(found, arguments.json)
+    for way, count in WAYS:
+        print(f"{way}, {count}:", json.dumps(machine()), flush=True)
+        with tempfile.TemporaryDirectory() as name:
+            found |= measure(way, count, arguments.run, arguments.rooms, Path(name))
+    report(found, arguments.json)
+    print_table(found)
 
 
 if __name__ == "__main__":
