@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +16,7 @@ from sceneprior.apps.priors.packed import name_of, version_of
 from sceneprior.apps.sample import request_of, sample_rooms
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.parallel import run_tasks
+from sceneprior.core.parallel import map_blocks, once
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.views import DecodedScenes, ObservedImage
 from sceneprior.paper.prior import TrainedPrior
@@ -78,19 +78,22 @@ class Prior:
         return {"prior": name_of(self.where), **version, "sceneprior": __version__}
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _loaded, (self.where,)  # each worker reads the weights itself, once
+        return once, (load, self.where)  # each worker reads the weights itself
 
     def _drawn(self, given: dict[str, Any], then: Then | None, **told: Any) -> list[Scene]:
-        """Rooms of `sample_rooms`, drawn in tasks of `BATCH` rooms."""
+        """Rooms of `sample_rooms`, drawn in tasks of `BATCH` rooms; an error if all of them lack
+        something that the request requires."""
         count = given["count"]
         # Other methods draw all their rooms at once.
         size = BATCH if isinstance(self.trained, TrainedPrior) else max(count, 1)
-        blocks = [range(count)[first : first + size] for first in range(0, count, size)]
-        tasks = {
-            f"rooms {rows[0]} to {rows[-1]}": (self, given, rows, then, told) for rows in blocks
-        }
-        title = None if then is None else f"drawing rooms ({size} at a time)"
-        return [room for part in run_tasks(_draw, tasks, title) for room in part]
+        title = "" if then is None else f"drawing rooms ({size} at a time)"
+        draw = partial(_draw, self, given, told, then)
+        rooms = map_blocks(draw, range(count), size, title)
+        lacks = [room.extra["lacks"] for room in rooms if "lacks" in room.extra]
+        if lacks and len(lacks) == len(rooms):
+            said = f"No room holds the request: {lacks[0]}"
+            raise InputError(f"{said} Ask for less, or for a larger floor.")
+        return rooms
 
     def _told(self, rooms: Sequence[Scene], **more: Any) -> list[Scene]:
         """Rooms with `origin` and `more` added at the start of `extra`."""
@@ -266,7 +269,7 @@ class Prior:
         """
         from sceneprior.apps.reconstruction.reconstruct import reconstruct
 
-        return reconstruct(self.trained, images, fit, restarts)
+        return reconstruct(self, images, fit, restarts)
 
     def latent(self, point: Point) -> Float[Tensor, " dimension"]:
         """The latent of a room, given like an end of `interpolate`.
@@ -303,16 +306,11 @@ class Prior:
         return with_latents(self.trained, self.where)
 
 
-@cache
-def _loaded(where: str) -> Prior:
-    return load(where)
-
-
 def _draw(
-    prior: Prior, given: dict[str, Any], rows: range, then: Then | None, told: dict[str, Any]
+    prior: Prior, given: Any, told: Any, then: Then | None, rows: range, first: int
 ) -> list[Scene]:
     rooms = prior._told(sample_rooms(prior.trained, rows=rows, **given), **told)
-    return rooms if then is None else then(rooms, rows.start)
+    return rooms if then is None else then(rooms, first)
 
 
 def _models(given: Sequence[SceneObject]) -> Callable[[list[Scene]], list[Scene]]:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from sceneprior.core.files import PARTS, list_files, write_whole
-from sceneprior.core.parallel import check_shared, run_tasks
+from sceneprior.core.parallel import check_shared, map_blocks
 from sceneprior.core.scene import Scene
 from sceneprior.core.scene_json import FORMAT
 from sceneprior.core.shell import ShellName
@@ -63,10 +63,8 @@ def write_scenes(scenes: Sequence[Scene], folder: Path, shell: ShellName = "none
     `latents.npz` is written if all scenes are decoded from latents.
     """
     check_names(scenes)
-    blocks = [scenes[first : first + BLOCK] for first in range(0, len(scenes), BLOCK)]
-    tasks = {f"rooms from {block[0].name} on": (block, len(scenes)) for block in blocks}
     with writing_scenes(folder, shell) as (write, written):
-        run_tasks(write, tasks, "writing scenes")
+        map_blocks(write, scenes, BLOCK, "writing scenes")
         written += scenes
 
 
@@ -101,7 +99,7 @@ def writing_scenes(
 
 
 def _write_some(
-    scenes: list[Scene], first: int, folder: Path, shell: ShellName, kept: int
+    scenes: Sequence[Scene], first: int, folder: Path, shell: ShellName, kept: int
 ) -> list[Scene]:
     from sceneprior.render.silhouettes.cpu.kernels import thread_count
 

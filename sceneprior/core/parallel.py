@@ -18,7 +18,7 @@ import threading
 import traceback
 import warnings
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -29,6 +29,7 @@ from concurrent.futures import (
     wait,
 )
 from contextvars import ContextVar
+from functools import cache
 from multiprocessing import connection
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -113,7 +114,8 @@ class _Cluster:
 
     def submit(self, *call: Any) -> Future[Any]:
         # Pickled here, so that it is unpickled by the thread and in the folder of the task.
-        return self.executor.submit(_run_there, Path.cwd(), pickle.dumps(call))  # type: ignore
+        here = self.client.id, Path.cwd()
+        return self.executor.submit(_run_there, *here, pickle.dumps(call))  # type: ignore
 
     def stop(self) -> None:
         self.executor.shutdown(wait=False)  # cancels what is submitted
@@ -192,6 +194,25 @@ def run_tasks(
         alike = not found and len({str(error) for error in failed.values()}) == 1
         raise failed.popitem()[1] if alike else _error_of(failed, len(tasks))
     return [found[name] for name in tasks]
+
+
+def map_blocks(
+    function: Callable[..., list[_Result]], items: Sequence[Any], size: int, title: str = ""
+) -> list[_Result]:
+    """Call `function(some, first)` in a task for every `size` items; `first` is the index of their
+    first. Returns all results in one list."""
+    tasks = {
+        f"items from {getattr(items[first], 'name', first)} on": (items[first:][:size], first)
+        for first in range(0, len(items), size)
+    }
+    return [each for part in run_tasks(function, tasks, title or None) for each in part]
+
+
+@cache
+def once(function: Callable[..., _Result], *arguments: Any) -> _Result:
+    """Call a function that opens files: in a worker, once a command; for `__reduce__`."""
+    with warnings.catch_warnings(action="ignore"):  # the command has shown them
+        return function(*arguments)
 
 
 def check_shared(path: Path) -> None:
@@ -288,14 +309,17 @@ def _start_worker() -> None:
     threading.Thread(target=end_with_parent, daemon=True).start()
 
 
-_thread = ThreadPoolExecutor(1)
+_thread, _command = ThreadPoolExecutor(1), [""]
 
 
-def _run_there(folder: Path, call: bytes) -> "_Answer":
+def _run_there(command: str, folder: Path, call: bytes) -> "_Answer":
     """Run a task in the folder of the command, and in the only thread for tasks: a worker may have
     several, but a GL context and our caches belong to one."""
     check_shared(folder)
     os.chdir(folder)
+    if _command != [command]:  # files may have changed since the last one
+        once.cache_clear()
+        _command[:] = [command]
     return _thread.submit(_run_pickled, call).result()
 
 

@@ -2,6 +2,7 @@
 distance, F-score and box IoU."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, StrictInt
 
 from sceneprior.core.boxes import box_iou_3d
 from sceneprior.core.errors import InputError
+from sceneprior.core.parallel import map_blocks
 from sceneprior.core.scene import Mesh, SceneObject
 from sceneprior.core.surfaces import chamfer_of, nearest_distances
 from sceneprior.evaluation.metric import COVERAGE, ratio, resample_counts
@@ -113,6 +115,8 @@ def upright_box_iou_3d(a: Mesh, b: Mesh) -> float:
     return float(shared / union) if union > 0 else 0.0
 
 
+BLOCK = 64
+"""Pairs of objects that a task compares."""
 RESAMPLES = 1000
 """Number of bootstrap resamples of rooms per interval."""
 ObjectPair = tuple[SceneObject, SceneObject | None]
@@ -156,6 +160,10 @@ def score_pair(pair: ObjectPair, points: int, seed: int = 0) -> PairScore:
     }
 
 
+def _score_pairs(points: int, pairs: Sequence[ObjectPair], first: int) -> list[PairScore]:
+    return [score_pair(pair, points, row) for row, pair in enumerate(pairs, first)]
+
+
 def score_views(
     views: Sequence[Sequence[ObjectPair]], rooms: Sequence[str], points: int = POINTS
 ) -> dict[str, Any]:
@@ -169,7 +177,7 @@ def score_views(
     pairs = [pair for view in views for pair in view]
     if not pairs:
         raise InputError("No image shows an object, so there is nothing to score.")
-    scores = [score_pair(pair, points, row) for row, pair in enumerate(pairs)]
+    scores = map_blocks(partial(_score_pairs, points), pairs, BLOCK, "scoring objects")
     by_class = {label: [score for score in scores if score["label"] == label]
                 for label in sorted({score["label"] for score in scores})}  # fmt: skip
     of_room = [room for room, view in zip(rooms, views, strict=True) for _ in view]

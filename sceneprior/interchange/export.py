@@ -14,7 +14,7 @@ from sceneprior.core.colliders import colliders, is_fixed, mass_kg, mesh_of
 from sceneprior.core.contact_resolution import Stable, make_stable
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import write_json, write_whole
-from sceneprior.core.parallel import check_shared, run_tasks
+from sceneprior.core.parallel import check_shared, map_blocks
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.core.shell import THICK_M, Shell, ShellName, shell_meshes, shell_of
 from sceneprior.interchange.box_lists import write_atiss
@@ -81,9 +81,8 @@ def export_scenes(
 def _export_standing(scenes: Sequence[Scene], to: str, folder: Path, shell: ShellName) -> Notes:
     """Make objects stable and write the rooms, in tasks of `BLOCK` rooms."""
     folder.mkdir(parents=True, exist_ok=True)
-    blocks = [scenes[first : first + BLOCK] for first in range(0, len(scenes), BLOCK)]
-    tasks = {f"rooms from {block[0].name} on": (block, to, folder, shell) for block in blocks}
-    found = [room for part in run_tasks(_settle, tasks, "settling rooms") for room in part]
+    settle = partial(_settle, to, folder, shell)
+    found = map_blocks(settle, scenes, BLOCK, "settling rooms")
     standing, notes = [each.scene for each in found], list[str]()
     changes = sum((each.changes for each in found), Counter[str]())
     if listed := ", ".join(f"{count} {change}" for change, count in changes.items() if count):
@@ -100,7 +99,9 @@ def _export_standing(scenes: Sequence[Scene], to: str, folder: Path, shell: Shel
     return Notes(notes, [said for each in found for said in each.left_out])
 
 
-def _settle(scenes: Sequence[Scene], to: str, folder: Path, shell: ShellName) -> list[Stable]:
+def _settle(
+    to: str, folder: Path, shell: ShellName, scenes: Sequence[Scene], first: int
+) -> list[Stable]:
     check_shared(folder)
     found = [make_stable(scene) for scene in scenes]
     SIMULATORS[to]([each.scene for each in found], folder, shell)

@@ -1,6 +1,8 @@
 """A map over tasks: results in order wherever it works, failures by name, processes that die."""
 
+import pickle
 import sys
+from pathlib import Path
 
 import parallel_tasks
 import pytest
@@ -38,6 +40,15 @@ def test_a_task_whose_process_dies_is_run_again_and_in_the_end_named(tmp_path):
             run_tasks(parallel_tasks.die_at_two, tasks(tmp_path, 99))
     done = [path.name for path in tmp_path.iterdir() if not path.name.startswith("death")]
     assert sorted(done) == ["0", "1", "3", "4", "5"]
+
+
+def test_what_a_worker_opens_is_kept_for_one_command(tmp_path):
+    call = pickle.dumps((parallel.once, Path.read_text, tmp_path / "read"))
+    found = []
+    for command, text in (("a", "1"), ("a", "2"), ("b", "3")):
+        (tmp_path / "read").write_text(text)
+        found.append(parallel._run_there(command, Path.cwd(), call).result)
+    assert found == ["1", "1", "3"]
 
 
 def test_only_a_few_tasks_are_submitted_at_a_time(monkeypatch):

@@ -1,5 +1,5 @@
-"""Rooms prepared, lifted, drawn, settled and evaluated by workers that are killed meanwhile: the
-same bytes as in one process."""
+"""Rooms prepared, lifted, drawn, given models, settled, reconstructed and evaluated by workers that
+are killed meanwhile: the same bytes as in one process."""
 
 import contextlib
 import multiprocessing
@@ -16,7 +16,9 @@ from data_prep.front.recipe import load_recipe
 from data_prep.front.source import FrontSource
 from data_prep.homes.make import make_homes
 from sceneprior.apps.api import load
-from sceneprior.apps.rooms import writing_scenes
+from sceneprior.apps.cli.rooms import retrieve
+from sceneprior.apps.reconstruction import reconstruct, score
+from sceneprior.apps.rooms import write_scenes, writing_scenes
 from sceneprior.core.files import write_json
 from sceneprior.core.parallel import on_workers
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
@@ -29,7 +31,7 @@ pytestmark = pytest.mark.slow
 RULES = ("views.per_m2=0.3", "views.image_size=[60, 80]", "views.at_least=3")
 
 
-def work(data, out):
+def work(data, toys, out):
     splits = data / "splits" / "bedroom.csv"
     recipe = load_recipe("bedroom", RULES)
     source = FrontSource(data / "3D-FRONT", data / "3D-FUTURE-model", recipe, splits)
@@ -41,14 +43,23 @@ def work(data, out):
     export_scenes(rooms[:20], "mujoco", out / "mujoco")
     options = EvalOptions(resamples=10)
     write_json(out / "scores.json", evaluate_synthesis(rooms[:8], out / "shards", options))
+    write_scenes(rooms[:6], out / "some")
+    retrieve(out / "some", out / "cad", data / "3D-FUTURE-model", data)
+    scores = score.evaluate_run(str(toys[0]), toys[1], "objects", 1, "test", 0, 2, None, toys[1])
+    assert scores.pop("cpu_seconds_an_image") > 0
+    write_json(out / "svr.json", scores)
 
 
 @pytest.fixture(scope="module")
-def homes(tmp_path_factory):
+def homes(tmp_path_factory, toy_run, toy_shards):
     folder = tmp_path_factory.mktemp("homes")
     make_homes(folder / "data", 20, "bedroom", 0)
-    work(folder / "data", folder / "alone")
-    return folder
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(reconstruct, "BATCH", 3)
+        patch.setattr(score, "BLOCK", 3)
+        patch.setattr("sceneprior.apps.retrieval.retrieve.BLOCK", 2)
+        work(folder / "data", (toy_run, toy_shards), folder / "alone")
+        yield folder
 
 
 @contextlib.contextmanager
@@ -67,7 +78,9 @@ def processes():
 
 
 @pytest.mark.parametrize("open_workers", [processes, cluster])
-def test_the_bytes_are_those_of_one_process_though_workers_die(homes, open_workers):
+def test_the_bytes_are_those_of_one_process_though_workers_die(
+    homes, open_workers, toy_run, toy_shards
+):
     out, killed = homes / open_workers.__name__, []
 
     def kill(a_worker):
@@ -81,7 +94,7 @@ def test_the_bytes_are_those_of_one_process_though_workers_die(homes, open_worke
     with open_workers() as a_worker:
         killer = threading.Thread(target=kill, args=(a_worker,), daemon=True)
         killer.start()
-        work(homes / "data", out)
+        work(homes / "data", (toy_run, toy_shards), out)
     killer.join(60)
     assert len(killed) == 2
     assert digests(out) == digests(homes / "alone")

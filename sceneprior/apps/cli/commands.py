@@ -23,8 +23,8 @@ add_commands(app, with_workers)
 for command in (
     with_workers(runs.fit), evaluation.report,
     with_workers(rooms.synthesize), rooms.interpolate, with_workers(rooms.complete),
-    rooms.retrieve,
-    rooms.reconstruct, evaluation.eval_svr,
+    with_workers(rooms.retrieve),
+    with_workers(rooms.reconstruct), with_workers(evaluation.eval_svr),
     runs.pack, runs.priors, with_workers(runs.export),
     with_workers(evaluation.evaluate), with_workers(evaluation.eval_fid),
     runs.compare, runs.demo, rooms.view,

@@ -48,7 +48,7 @@ def synthesize(
     prior = load(run)
     with writing_scenes(out, drawn, html) as (write, scenes):
         scenes += prior.sample(count, seed, distribution, **asked, cad=cad, then=write)
-    options.note_unmet(scenes)
+    status = options.note_unmet(scenes)
     origin = distribution or prior.distribution
     if html:
         told = f"run {Path(run).resolve().name} · seed {seed} · from: {origin}"
@@ -61,6 +61,7 @@ def synthesize(
             f"{', '.join(empty[:MOST_TOLD])}{more}. Train longer, or on more rooms.",
             err=True,
         )
+    raise typer.Exit(status)
 
 
 def interpolate(
@@ -118,12 +119,13 @@ def complete(
     prior = load(run)
     with writing_scenes(out, drawn) as (write, scenes):
         scenes += prior.complete(scene, count, seed, wanted, **asked, cad=cad, then=write)
-    options.note_unmet(scenes)
+    status = options.note_unmet(scenes)
     given_objects = f"{len(scene.objects)} given object{'s' * (len(scene.objects) != 1)}"
     typer.echo(f"Wrote {options.rooms_in_words(count)} around {given_objects} to {out}")
     for room in scenes:
         if lacking := room.extra.get("no_place"):
             typer.echo(f"Note: {room.name} has no place for {', '.join(lacking)}.", err=True)
+    raise typer.Exit(status)
 
 
 def reconstruct(
@@ -226,29 +228,21 @@ def retrieve(
 ) -> None:
     """Replace every object by the most similar CAD model of its class."""
     check_free(out, overwrite)  # before imports that take seconds
-    from rich.console import Console
-    from rich.progress import track
-
     from sceneprior.apps.retrieval.cad_models import made_models, open_models
     from sceneprior.apps.retrieval.retrieve import retrieval_report, retrieve_all
-    from sceneprior.apps.rooms import write_scenes
+    from sceneprior.apps.rooms import writing_scenes
     from sceneprior.core.files import write_json
     from sceneprior.evaluation.metrics.contents import common_label_set
-    from sceneprior.render.scene_files import load_scene_folder
+    from sceneprior.render.scene_files import check_names, load_scene_folder
 
-    console = Console(stderr=True)
     rooms = load_scene_folder(scenes)
-    if models is None:
-        cad_models = made_models()
-    else:
-        cad_models = open_models(
-            models, common_label_set(rooms), cache,
-            track=lambda ids: track(ids, "Reading models", console=console, transient=True),
-        )  # fmt: skip
-    chosen = retrieve_all(rooms, cad_models)
-    made = list(track(chosen, "Choosing models", total=len(rooms), console=console))
+    cad_models = made_models()
+    if models is not None:
+        cad_models = open_models(models, common_label_set(rooms), cache)
+    check_names(rooms)
+    with writing_scenes(out) as (write, made):
+        made += retrieve_all(rooms, cad_models, then=write)
     report = retrieval_report(made, cad_models)
-    write_scenes(made, out)
     write_json(out / "retrieval.json", report)
     typer.echo(f"Gave {report['objects_with_a_model']} of {report['objects']} objects a model")
     if report["classes_without_models"]:

@@ -16,10 +16,6 @@ from sceneprior.apps.cli.options import option
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import check_free
 
-LEFT_OUT = 3
-"""Exit status of a strict export that lacks an object."""
-
-
 TABLES = "compare/paper.yaml"
 
 
@@ -299,4 +295,4 @@ def export(
             typer.echo(f"Note: {note}", err=True)
     typer.echo(f"Wrote {options.rooms_in_words(len(rooms))} to {out}")
     if strict and left_out:
-        raise typer.Exit(LEFT_OUT)
+        raise typer.Exit(options.LEFT_OUT)

@@ -1,10 +1,14 @@
 """Reconstruct rooms from instance masks of single images, object by object or by latents, and write
 scenes, and pictures of the masks next to the result."""
 
+import time
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,6 +22,7 @@ from sceneprior.core.cameras import Pinhole, boxes_of_points, pixel_rays
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import write_whole
+from sceneprior.core.parallel import run_tasks
 from sceneprior.core.repeatable import single_threaded
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.views import ObservedImage, SceneViews, as_views, rows_of
@@ -39,7 +44,7 @@ from sceneprior.render.topdown import topdown, topdown_protocol
 from sceneprior.training.method import Trained, TrainedReconstructor
 
 BATCH = 128
-"""Number of latents fitted at once: images times restarts."""
+"""Number of images of a task, times restarts: the latents fitted at once."""
 OBJECTS = "objects"
 """Value of `fit` for the object-by-object fit of the lifted method; any other value names a
 schedule (`SCHEDULES`) with which a latent is fitted."""
@@ -74,28 +79,31 @@ class Reconstruction:
     """Steps of a latent fit; None for other fits."""
     taken_for: dict[str, str] = field(default_factory=dict)
     """See `ObjectAnswer.taken_for`."""
+    cpu_s: float = 0.0
+    """CPU seconds that it took."""
 
 
-@single_threaded()
 def reconstruct(
-    trained: Trained,
+    prior: Any,
     images: Sequence[ObservedImage],
     fit: str = OBJECTS,
     restarts: int = 1,
     masks: bool = True,
 ) -> list[Reconstruction]:
-    """Reconstruct images of the run's label set, in batches.
+    """Reconstruct images of the run's label set, a batch a task.
 
     Scenes have no meshes if the run's shape stage has not been trained. A baseline that predicts
     objects from images directly is used without a fit.
 
     Args:
+        prior: A `Prior`, which workers load themselves, or a `Trained`.
         fit: `objects` fits object by object; a name of `SCHEDULES` fits one latent per image.
         restarts: Number of latents fitted to each image, started at the nearest training rooms; the
             latent with the lowest score is kept.
         masks: Also fit latents to masks. False uses only classes and 2D boxes, as is always done if
             shapes are posed prototypes rather than meshes.
     """
+    trained: Trained = getattr(prior, "trained", prior)
     if fit not in (OBJECTS, *SCHEDULES):
         raise InputError(
             f"No fit is called '{fit}'; choose from {', '.join((OBJECTS, *SCHEDULES))}."
@@ -117,29 +125,37 @@ def reconstruct(
                 f"{image.name} has classes of label set '{image.label_set}', but the run was "
                 f"trained on '{trained.config.label_set}'; prepare the image with that label set."
             )
-    if not images:
-        return []
-    if isinstance(trained, TrainedPrior) and fit == OBJECTS:
-        return [
-            Reconstruction(image, answer.scene, answer.energy, taken_for=answer.taken_for)
-            for image, answer in zip(images, answer_images(trained, images), strict=True)
-        ]
     # Batches of images of one size with similar numbers of objects, to limit padding.
     by_size: dict[tuple[int, ...], list[int]] = defaultdict(list)
     for row in sorted(range(len(images)), key=lambda row: len(images[row].object_class)):
         by_size[images[row].instance_ids.shape].append(row)
     most = max(BATCH // restarts, 1)
-    found: dict[int, Reconstruction] = {}
-    for size in by_size.values():
-        for rows in (size[at : at + most] for at in range(0, len(size), most)):
-            part = [images[row] for row in rows]
-            if isinstance(trained, TrainedReconstructor):
-                answers = _found_directly(trained, part)
-            else:
-                assert isinstance(trained, TrainedPrior), "checked above: it remembers rooms"
-                answers = _fitted(trained, part, fit, restarts, masks)
-            found |= zip(rows, answers, strict=True)
+    batches = [
+        size[at : at + most] for size in by_size.values() for at in range(0, len(size), most)
+    ]
+    tasks = {f"batch from {images[b[0]].name} on": ([images[row] for row in b],) for b in batches}
+    answers = run_tasks(partial(_reconstructed, prior, fit, restarts, masks), tasks, "fitting")
+    found = dict(zip(chain(*batches), chain(*answers), strict=True))
     return [found[row] for row in range(len(images))]
+
+
+@single_threaded()
+def _reconstructed(
+    prior: Any, fit: str, restarts: int, masks: bool, images: Sequence[ObservedImage]
+) -> list[Reconstruction]:
+    """Reconstruct one batch."""
+    begin, trained = time.process_time(), getattr(prior, "trained", prior)
+    if isinstance(trained, TrainedReconstructor):
+        found = _found_directly(trained, images)
+    elif fit != OBJECTS:
+        found = _fitted(trained, images, fit, restarts, masks)
+    else:
+        found = [
+            Reconstruction(image, answer.scene, answer.energy, taken_for=answer.taken_for)
+            for image, answer in zip(images, answer_images(trained, images), strict=True)
+        ]
+    cpu_s = (time.process_time() - begin) / len(images)
+    return [replace(one, cpu_s=cpu_s) for one in found]
 
 
 def _found_directly(

@@ -1,20 +1,21 @@
 """Score reconstructions from single views against the true rooms, and print the scores."""
 
-import time
 from collections import defaultdict
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.table import Table
 
-from sceneprior.apps.config import load_any_run
+from sceneprior.apps.api import load
 from sceneprior.apps.reconstruction.reconstruct import reconstruct
 from sceneprior.apps.retrieval.cad_models import open_models
 from sceneprior.apps.retrieval.retrieve import retrieve_all
 from sceneprior.core.errors import InputError
 from sceneprior.core.ground_truth import models_of, reference_scenes
+from sceneprior.core.parallel import map_blocks
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.shards import iterate_rooms
 from sceneprior.core.views import ObservedImage, image_of_room, images_of_split
@@ -48,6 +49,8 @@ COLUMNS = {
     "class_accuracy": ("class", "{:.2f}"),
 }
 
+BLOCK = 16
+"""Images that a task compares with all training rooms."""
 Answers = Sequence[Sequence[SceneObject | None]]
 """Reconstructed objects by image and mask; None for a mask without an object."""
 
@@ -73,27 +76,25 @@ def evaluate_run(
         count: Number of views drawn from each room; all if a room has fewer.
         limit: Number of rooms; None takes all.
     """
-    trained = load_any_run(run)
+    prior = load(run)
     reference_scenes(shards, split, limit=1, meshes=False)  # raises before any fit
     images, blank = images_of_split(shards, split, seed, limit, count)
-    begin = time.process_time()
-    fitted = reconstruct(trained, images, fit, restarts)
-    seconds = time.process_time() - begin
+    fitted = reconstruct(prior, images, fit, restarts)
     answers: dict[str, Answers] = {
         "fit": [one.scene.objects for one in fitted],
         "fit_boxes": [one.scene.without_meshes().objects for one in fitted],
     }
     if models is not None:
-        cad_models = open_models(models, trained.config.label_set)
+        cad_models = open_models(models, prior.label_set)
         retrieved = retrieve_all([one.scene for one in fitted], cad_models)
         answers["fit_cad"] = [scene.objects for scene in retrieved]
     overlaps = [one.mask_iou for one in fitted if one.mask_iou is not None]
     if overlaps:
-        plain = reconstruct(trained, images, fit, restarts, masks=False)
+        plain = reconstruct(prior, images, fit, restarts, masks=False)
         answers["layout_fit"] = [one.scene.without_meshes().objects for one in plain]
     protocol = {
         "run": Path(run).resolve().name,
-        "stage": trained.stage,
+        "stage": prior.trained.stage,
         "views": "drawn at random from those that show an object",
         "views_per_room": count,
         "rooms_without_such_a_view": blank,
@@ -102,7 +103,7 @@ def evaluate_run(
     }
     more = {
         "mask_iou": sum(overlaps) / len(overlaps) if overlaps else None,
-        "cpu_seconds_an_image": seconds / len(images),
+        "cpu_seconds_an_image": sum(one.cpu_s for one in fitted) / len(images),
     }
     return _scored(images, answers, shards, split, seed, protocol, more)
 
@@ -160,10 +161,11 @@ def _scored(
 ) -> dict[str, Any]:
     """A result file: scores by row, of the given reconstructions and of training rooms as
     baselines, and the settings."""
-    rooms, renderer, rng = KnownRooms(shards), SoftwareRenderer(), np.random.default_rng(seed)
+    rooms, rng = KnownRooms(shards), np.random.default_rng(seed)
+    nearest = partial(_nearest_rooms, rooms)
     answers = {
         **answers,
-        "nearest_room": [rooms.nearest(image, renderer).objects for image in images],
+        "nearest_room": map_blocks(nearest, images, BLOCK, "comparing training rooms"),
         "random_room": [rooms.drawn(image, rng).objects for image in images],
     }
     true_rooms = reference_scenes(shards, split, tracked_only=True)
@@ -189,6 +191,11 @@ def _scored(
         **PROTOCOL,
     }
     return {"rows": rows, **more, "protocol": protocol}
+
+
+def _nearest_rooms(rooms: KnownRooms, images: Sequence[ObservedImage], first: int) -> list[Any]:
+    renderer = SoftwareRenderer()
+    return [rooms.nearest(image, renderer).objects for image in images]
 
 
 def print_view_scores(scores: dict[str, Any]) -> None:

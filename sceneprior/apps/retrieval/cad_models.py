@@ -14,14 +14,16 @@ first needs its class, in 10 to 100 ms.
 import hashlib
 import os
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from rich.console import Console
+from rich.progress import track
 
 from sceneprior.core.checked import keep_arrays, kept_arrays
 from sceneprior.core.classes import LABEL_SETS, label_set
@@ -42,6 +44,7 @@ from sceneprior.core.furniture import (
     tidy_category,
 )
 from sceneprior.core.ground_truth import model_path, read_model
+from sceneprior.core.parallel import once
 from sceneprior.core.scene import Mesh, Textured
 from sceneprior.core.shards import INDEX_NAME, iterate_rooms
 from sceneprior.core.surfaces import surface_points
@@ -57,9 +60,6 @@ _FLAT = 1e-9
 """Ratio to the longest side up to which a side counts as flat; flat sides are not scaled."""
 _MESHES_KEPT = 256
 _TEXTURED_KEPT = 32
-
-Track = Callable[[list[str]], Iterable[str]]
-"""Wraps an iterable of model ids, for a progress bar."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +82,11 @@ class CadModels:
     """Loads the parts of this mesh with their materials; none for a model without materials."""
     broken: Mapping[str, str] = field(default_factory=dict)
     """Ids of unusable models, each with the reason."""
+    opened_by: tuple[Any, ...] = ()
+    """The function that opens the same models in a worker, and its arguments."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return once, self.opened_by
 
 
 @cache
@@ -103,6 +108,7 @@ def made_models() -> CadModels:
     return CadModels(
         lambda label: _made_of(label)[0] if label in furniture_classes() else None,
         lambda model_id: _made_of(model_id.rpartition("_")[0])[1][model_id],
+        opened_by=(made_models,),
     )
 
 
@@ -120,9 +126,7 @@ class _ModelFiles(NamedTuple):
     """Reads the parts of a model with their materials; none for models in class colours."""
 
 
-def open_models(
-    folder: Path, label_set_name: str, cache: Path | None = None, track: Track = iter
-) -> CadModels:
+def open_models(folder: Path, label_set_name: str, cache: Path | None = None) -> CadModels:
     """Open the models of a label set's classes, with points on their surfaces.
 
     Args:
@@ -137,7 +141,7 @@ def open_models(
     folder = Path(folder)
     files = _find_models(folder, label_set_name)
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    points, broken = _points_of_models(folder, files, cache or home / "sceneprior", track)
+    points, broken = _points_of_models(folder, files, cache or home / "sceneprior")
     by_class = {}
     for label in label_set(label_set_name):
         if ids := tuple(m for m in points if files.labels[m] == label):
@@ -161,7 +165,7 @@ def open_models(
         )
 
     kept = lru_cache(_MESHES_KEPT)(load), lru_cache(_TEXTURED_KEPT)(textured)
-    return CadModels(by_class.get, *kept, broken)
+    return CadModels(by_class.get, *kept, broken, (open_models, folder, label_set_name, cache))
 
 
 def _find_models(folder: Path, label_set_name: str) -> _ModelFiles:
@@ -289,7 +293,7 @@ def read_textured(path: Path) -> tuple[Textured, ...]:
 
 
 def _points_of_models(
-    folder: Path, files: _ModelFiles, cached: Path, track: Track
+    folder: Path, files: _ModelFiles, cached: Path
 ) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Sample points of each model; returns them, and the reasons for broken models.
 
@@ -309,7 +313,9 @@ def _points_of_models(
             broken[model_id] = str(error)
     points = {key: before[key] for key in keys.values() if key in before}
     try:
-        for model_id in track([m for m, key in keys.items() if key not in points]):
+        new = [m for m, key in keys.items() if key not in points]
+        shown = {"console": Console(stderr=True), "transient": True, "disable": not new}
+        for model_id in track(new, "reading models", **shown):
             try:
                 points[keys[model_id]] = _unit_samples(files.read(files.path_of(model_id)))
             except (InputError, ValueError) as error:

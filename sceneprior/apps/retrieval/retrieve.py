@@ -8,10 +8,10 @@ its box.
 All models and turns are first compared by few points, and the best candidates by all points.
 """
 
-import os
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,12 +20,16 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from sceneprior.apps.api import Then
 from sceneprior.apps.retrieval.cad_models import CadModels, ClassModels, made_models
 from sceneprior.core.boxes import QUARTERS, quarter_rotation
+from sceneprior.core.parallel import map_blocks
+from sceneprior.core.repeatable import single_threaded
 from sceneprior.core.scene import Mesh, Scene, SceneObject, quarter_turned
 from sceneprior.core.surfaces import chamfer_mean, surface_points
 from sceneprior.lifted.requests.wishes import BY_FRONT
 from sceneprior.render.appearance import box_mesh
+from sceneprior.render.silhouettes.cpu.kernels import thread_count
 
 STANDS_M = 1.0
 """Largest height of a box's centre for which the box is extruded to the floor."""
@@ -40,6 +44,8 @@ factor, a cupboard facing backwards has only 1.0 to 1.1 times the distance of on
 chair has 1.5 times."""
 SURE = 0.5
 """Minimum confidence at which a yaw counts as known."""
+BLOCK = 32
+"""Rooms of a task."""
 _BLOCK = 2**16
 """Number of squared distances computed at a time, to fit in a core's cache."""
 
@@ -88,12 +94,19 @@ def retrieve(scene: Scene, models: CadModels, keep: Collection[int] = ()) -> Sce
 
 
 def retrieve_all(
-    scenes: Sequence[Scene], models: CadModels, keep: Collection[int] = ()
-) -> Iterator[Scene]:
-    """Apply `retrieve` to many scenes on all cores; yields the results in the scenes' order."""
-    # One thread per core, each with one torch thread, since the matrix products are small.
-    with ThreadPoolExecutor(os.cpu_count(), initializer=torch.set_num_threads, initargs=(1,)) as p:
-        yield from p.map(lambda scene: retrieve(scene, models, keep), scenes)
+    scenes: Sequence[Scene], models: CadModels, then: Then | None = None
+) -> list[Scene]:
+    """Apply `retrieve` to many scenes, and `then` as in `Prior.sample`, in tasks of `BLOCK`."""
+    some = partial(_retrieve_some, models, (), then)
+    return map_blocks(some, scenes, BLOCK, "choosing models")
+
+
+def _retrieve_some(
+    models: CadModels, keep: Collection[int], then: Then | None, scenes: Sequence[Scene], first: int
+) -> list[Scene]:
+    with single_threaded(), ThreadPoolExecutor(thread_count()) as pool:
+        found = [*pool.map(lambda scene: retrieve(scene, models, keep), scenes)]
+    return found if then is None else then(found, first)
 
 
 def with_models(scenes: Sequence[Scene], given: Sequence[SceneObject] = ()) -> list[Scene]:
@@ -104,7 +117,7 @@ def with_models(scenes: Sequence[Scene], given: Sequence[SceneObject] = ()) -> l
             it.
     """
     keep = [row for row, item in enumerate(given) if item.mesh is not None]
-    return list(retrieve_all(scenes, made_models(), keep))
+    return _retrieve_some(made_models(), keep, None, scenes, 0)
 
 
 def retrieval_report(scenes: Sequence[Scene], models: CadModels) -> dict[str, Any]:

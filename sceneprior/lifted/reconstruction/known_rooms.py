@@ -7,7 +7,7 @@ that they are compared with.
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from sceneprior.core.cameras import Pinhole, boxes_of_points
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.ground_truth import reference_scene
+from sceneprior.core.parallel import once
 from sceneprior.core.scene import Mesh, Scene, SceneObject
 from sceneprior.core.shards import Shard, iterate_rooms
 from sceneprior.core.views import DecodedScenes, ObservedImage, as_views, rows_of
@@ -73,6 +74,9 @@ class KnownRooms:
         self._centers_m = pad_sequence(centers_m, True, ABSENT_M)
         sizes_m = [torch.from_numpy(scene.sizes_m).float() for scene in self.scenes]
         self._sizes_m = pad_sequence(sizes_m, True)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return once, (KnownRooms, self._folder)  # each worker reads the rooms itself
 
     def furnished(self, row: int) -> Scene:
         """`scenes[row]` with its meshes."""

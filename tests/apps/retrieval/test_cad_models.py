@@ -65,8 +65,8 @@ def read(monkeypatch):
     return reads
 
 
-def opened(folder, label_set_name="front3d_bedroom", **options):
-    return open_models(folder, label_set_name, folder.parent / "cache", **options)
+def opened(folder, label_set_name="front3d_bedroom"):
+    return open_models(folder, label_set_name, folder.parent / "cache")
 
 
 def ids_of(models):
@@ -108,13 +108,14 @@ def test_points_are_sampled_once_and_again_where_a_file_changed(folder, read):
     np.testing.assert_array_equal(beds, opened(folder).of_class("double_bed").points)
 
 
-def test_points_sampled_before_an_interrupt_are_kept(folder, read):
-    def stop_after_two(ids):
+def test_points_sampled_before_an_interrupt_are_kept(folder, read, monkeypatch):
+    def stop_after_two(ids, *_, **__):
         yield from ids[:2]
         raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
-        opened(folder, track=stop_after_two)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(cad_models, "track", stop_after_two)
+        opened(folder)
     done = set(read) - {"nan", "faceless", "point"}
     read.clear()
     opened(folder)
