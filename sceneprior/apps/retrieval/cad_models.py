@@ -314,8 +314,8 @@ def _points_of_models(
     points = {key: before[key] for key in keys.values() if key in before}
     try:
         new = [m for m, key in keys.items() if key not in points]
-        shown = {"console": Console(stderr=True), "transient": True, "disable": not new}
-        for model_id in track(new, "reading models", **shown):
+        console = Console(stderr=True, quiet=not new)
+        for model_id in track(new, "reading models", console=console, transient=True):
             try:
                 points[keys[model_id]] = _unit_samples(files.read(files.path_of(model_id)))
             except (InputError, ValueError) as error:

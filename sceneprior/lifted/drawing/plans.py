@@ -146,8 +146,9 @@ def plan_rooms(
             if shape is None or not shape.lacks:
                 break
         shapes.append(shape)
-    if floor is not None and shapes and all(shape and shape.lacks for shape in shapes):
-        raise InputError(shapes[0].lacks)
+    lacks = [shape.lacks for shape in shapes if shape]
+    if floor is not None and lacks and all(lacks):
+        raise InputError(lacks[0])
     counts = sampler.counts(known)[0]
     counts = (counts + F.one_hot(required, len(counts)).sum(dim=0)).expand(count, -1)
     free = slots - int(counts[0].sum())
