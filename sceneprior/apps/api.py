@@ -13,7 +13,7 @@ from torch import Tensor
 from sceneprior import __version__
 from sceneprior.apps.config import load_any_run, weights_of, with_latents
 from sceneprior.apps.priors.packed import name_of, version_of
-from sceneprior.apps.sample import request_of, sample_rooms
+from sceneprior.apps.sample import Then, request_of, sample_rooms
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.parallel import map_blocks, once
@@ -25,9 +25,6 @@ from sceneprior.training.method import Trained
 
 if TYPE_CHECKING:
     from sceneprior.apps.reconstruction.reconstruct import Reconstruction
-
-
-Then = Callable[[list[Scene], int], list[Scene]]
 
 
 def load(where: str | Path) -> "Prior":

@@ -18,6 +18,9 @@ from sceneprior.paper.prior import TrainedPrior
 from sceneprior.paper.sampling import decode_latents, draw_latents
 from sceneprior.training.method import Trained, TrainedReconstructor
 
+Then = Callable[[list[Scene], int], list[Scene]]
+"""What a task does with its rooms, such as writing them, given the number of the first one."""
+
 
 @single_threaded()
 def sample_rooms(

@@ -20,8 +20,8 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from sceneprior.apps.api import Then
 from sceneprior.apps.retrieval.cad_models import CadModels, ClassModels, made_models
+from sceneprior.apps.sample import Then
 from sceneprior.core.boxes import QUARTERS, quarter_rotation
 from sceneprior.core.parallel import map_blocks
 from sceneprior.core.repeatable import single_threaded
