@@ -90,7 +90,7 @@ def test_a_resumed_run_ends_as_one_that_was_never_stopped(toy_shards, tmp_path, 
     whole, again = tmp_path / "whole", tmp_path / "run"
     fit(tiny_sampler_config(toy_shards), whole, trainer_options=CPU)
     events = EventAccumulator(str(whole / "sampler")).Reload()
-    assert events.Images("rooms/drawn")[-1].step == 3
+    assert events.Images("rooms/drawn")[0].step == 1
     with monkeypatch.context() as patch, pytest.raises(StopError):
         patch.setattr("sceneprior.lifted.sampler.stage.SamplerStage", Stopped)
         fit(tiny_sampler_config(toy_shards), again, trainer_options=CPU)
