@@ -45,6 +45,7 @@ PRIORS = {
     "bedroom": BEDROOMS,
     "demo-bedroom": BEDROOMS,
     "procthor-bedroom": BEDROOMS,
+    "living": LIVING_ROOMS,
     "procthor-living": LIVING_ROOMS,
 }
 
