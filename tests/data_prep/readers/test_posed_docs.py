@@ -33,7 +33,7 @@ def test_the_example_runs_as_printed(tmp_path, monkeypatch):
     assert "<h2>New rooms</h2>" in page and "have no 3D boxes" in page and "Real, test" not in page
     assert "<h2>Training input</h2>" in page and "<h2>Learning curves</h2>" in page
     scores = json.loads(Path("run/scores.json").read_text())
-    assert scores["category_kl"] > 0 and "mask_iou_training_views" not in scores
+    assert 0 <= scores["category_kl"] < 0.1 and "mask_iou_training_views" not in scores
     assert "known from views alone" in page
 
 
