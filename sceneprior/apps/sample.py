@@ -19,7 +19,7 @@ from sceneprior.paper.sampling import decode_latents, draw_latents
 from sceneprior.training.method import Trained, TrainedReconstructor
 
 Then = Callable[[list[Scene], int], list[Scene]]
-"""What a task does with its rooms, such as writing them, given the number of the first one."""
+"""Function of a task's rooms and the number of the first one, such as one that writes them."""
 
 
 @single_threaded()
