@@ -46,7 +46,7 @@ TOWARDS_RAD = np.pi / 4
 BEFORE_M = 0.6
 """Depth of the floor before a front that must be free."""
 FREE_SHARE = 0.7
-"""Share of the floor before a front that must be in the room and free."""
+"""Share of a place, such as the floor before a front, that must be in the room and free."""
 BACK_M = 0.1
 """Largest distance of a back from a wall or another piece."""
 LOW_M = 0.15
@@ -207,23 +207,31 @@ def at_table(chair: Piece, table: Piece) -> bool:
     return bool(chair.place.distance(table.place) <= AT_TABLE_M)
 
 
+def seats_at(pieces: Sequence[Piece]) -> dict[int, int]:
+    """The rows of chairs at tables, and of the table of each."""
+    tables, found = rows_of(pieces, TABLES), {}
+    for chair in rows_of(pieces, CHAIRS):
+        if tables:
+            apart_m = [pieces[chair].place.distance(pieces[row].place) for row in tables]
+            table = tables[int(np.argmin(apart_m))]
+            if at_table(pieces[chair], pieces[table]):
+                found[chair] = table
+    return found
+
+
 def _seats(pieces: Sequence[Piece]) -> dict[str, list[Finding]]:
     """Chairs at tables, chairs turned to their table, and large tables with a chair."""
     tables = rows_of(pieces, TABLES)
     if not tables:
         return {}
-    nearest = {
-        chair: min(tables, key=lambda row: pieces[chair].place.distance(pieces[row].place))
-        for chair in rows_of(pieces, CHAIRS)
-    }
-    at = {c: t for c, t in nearest.items() if at_table(pieces[c], pieces[t])}
+    at = seats_at(pieces)
     large = [
         row
         for row in tables
         if max(pieces[row].size_m[::2]) >= LARGE_M and pieces[row].size_m[1] >= HIGH_M
     ]
     return {
-        "chairs_at_tables": [Finding((chair,), chair in at) for chair in nearest],
+        "chairs_at_tables": [Finding((chair,), chair in at) for chair in rows_of(pieces, CHAIRS)],
         "chairs_turned": [
             Finding((chair, table), pieces[chair].faces(pieces[table]))
             for chair, table in at.items()
@@ -267,12 +275,13 @@ def fronts(pieces: Sequence[Piece], floor: shapely.Geometry) -> dict[str, list[F
 
 
 def has_free_front(piece: Piece, others: Sequence[Piece], floor: shapely.Geometry) -> bool:
-    """True if `FREE_SHARE` of the floor before a piece is in the room and free of others."""
-    before = piece.before(BEFORE_M)
-    blocking = [
-        other.place
-        for other in others
-        if other.size_m[1] > LOW_M and other.label not in (*CHAIRS, "stool")
-    ]
-    open_m2 = before.intersection(floor).difference(shapely.unary_union(blocking)).area
-    return bool(open_m2 >= FREE_SHARE * before.area)
+    """True if the floor before a piece is free (`is_free`) of all but chairs."""
+    blocking = [other for other in others if other.label not in (*CHAIRS, "stool")]
+    return is_free(piece.before(BEFORE_M), blocking, floor)
+
+
+def is_free(place: shapely.Polygon, others: Iterable[Piece], floor: shapely.Geometry) -> bool:
+    """True if `FREE_SHARE` of a place is in the room and free of others."""
+    blocking = [other.place for other in others if other.size_m[1] > LOW_M]
+    open_m2 = place.intersection(floor).difference(shapely.unary_union(blocking)).area
+    return bool(open_m2 >= FREE_SHARE * place.area)

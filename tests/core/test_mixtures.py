@@ -47,6 +47,23 @@ def test_draws_follow_the_density():
     assert stats.kstest(values, below).pvalue > 0.01
 
 
+def test_denser_draws_are_the_first_of_the_densest_tries():
+    torch.manual_seed(1)
+    mixture = LogisticMixture.of(torch.randn(5, 9), 1)
+    uniform = torch.rand(5, 3, 6, 2)
+    found = mixture.denser(uniform, 2)
+    for row in range(5):
+        one = LogisticMixture(*(part[row] for part in mixture))
+        for draw in range(3):
+            values = [one.draw(choice, place[None]) for choice, place in uniform[row, draw]]
+            density = [float(one.log_prob(value)) for value in values]
+            best = sorted(density)[-2:]
+            kept = [value for value, own in zip(values, density, strict=True) if own in best]
+            assert_close(found[row, draw], kept[0][0])
+    every = mixture.denser(uniform, 6)
+    assert_close(every, mixture.denser(uniform[:, :, :1], 1))
+
+
 def test_gradients_are_right():
     values = torch.tensor([[0.1, 0.7]], dtype=torch.float64, requires_grad=True)
     features = torch.randn(1, 10, dtype=torch.float64, requires_grad=True)

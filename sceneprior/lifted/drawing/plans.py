@@ -64,7 +64,7 @@ class Effort(NamedTuple):
     successful attempt counts. A step takes about as long for one room as for these."""
 
 
-PLAIN = Effort(particles=1, attempts=48, attempts_per_plan=16, whole=47, sound=0, together=32)
+PLAIN = Effort(particles=1, attempts=48, attempts_per_plan=24, whole=47, sound=0, together=32)
 """For rooms whose conditions are inputs of the network: a rectangle, and given objects."""
 REQUESTED = Effort(particles=6, attempts=12, attempts_per_plan=1, whole=4, sound=6, together=1)
 """For rooms with a floor, openings or wishes, which places are checked against."""

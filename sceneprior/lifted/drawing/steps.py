@@ -17,16 +17,16 @@ from sceneprior.lifted.requests.relations import Furniture, furniture_of
 from sceneprior.lifted.requests.rules import PlacementRules
 from sceneprior.lifted.sampler.contents import END
 from sceneprior.lifted.sampler.network import EncoderState, RoomSampler
-from sceneprior.lifted.sampler.placement import Places
+from sceneprior.lifted.sampler.placement import DRAWS, Places
 
 TRIES = 4
 """Places drawn for an object in each particle; the first allowed one is taken. With more, an object
 whose likely places are taken would end up at an unlikely one."""
-NUMBERS = 3 + 4 * TRIES
+NUMBERS = 3 + 4 * DRAWS * TRIES
 """Uniform random numbers of a particle in a step."""
 LOOK_SHARPNESS, TWINS_SHARPNESS = 1.5, 3.0
 """Powers to which the probabilities of looks are raised, of a class's first object and of the next
-ones, which mostly look alike; see `SHARPNESS` of places."""
+ones, which mostly look alike; distributions learnt from a few hundred rooms are too broad."""
 CANDIDATES = 128
 """Places in the whole room that are tried for a required object without a drawn place."""
 COMPARED = 16
@@ -164,11 +164,12 @@ def place_next(
     now, numbers = _Step(particles, rows, step), numbers[rows]
     waiting, spare = torch.arange(len(rows)), dict[int, tuple[Tensor, Tensor]]()
     found = now.proposed(waiting, numbers[:, :3])
-    x = (places := found.places()).draw_x(numbers[:, 3:].unflatten(1, (TRIES, 4))[..., :2])
+    for_x, for_z = numbers[:, 3:].unflatten(1, (2, TRIES, DRAWS, 2)).unbind(dim=1)
+    x = (places := found.places()).draw_x(for_x)
     for number in range(TRIES):
         own = found.rows(waiting)
-        z_numbers = numbers[waiting, 5 + 4 * number : 7 + 4 * number]
-        boxes_m = own.boxes_m(places.rows(waiting).draw(x[waiting, number], z_numbers))
+        place_m = places.rows(waiting).draw(x[waiting, number], for_z[waiting, number])
+        boxes_m = own.boxes_m(place_m)
         boxes_m = resolve_overlap(boxes_m, own.state, own.apart())
         fits = violation(boxes_m, own.state, own.apart()) == 0
         if particles.rules is not None:

@@ -9,18 +9,9 @@ import numpy as np
 import shapely
 from jaxtyping import Bool, Float, Int
 
-from sceneprior.core.arrangements import (
-    BEDS,
-    NIGHTSTANDS,
-    OPENED,
-    Piece,
-    end_of_bed,
-    findings,
-    floor_beside,
-    heads,
-    rows_of,
-)
+from sceneprior.core.arrangements import NIGHTSTANDS
 from sceneprior.core.shell import space_before
+from sceneprior.lifted.requests.faults import PATH_M, Fault, faults_of, places_to_reach
 from sceneprior.lifted.requests.floors import RoomShape
 from sceneprior.lifted.requests.relations import Furniture, RelationChecks, footprints
 from sceneprior.lifted.requests.wishes import RelationWish
@@ -31,8 +22,6 @@ FLUSH_M = 0.15
 counts as standing with its back to this side."""
 WALL_M = 0.3
 """Maximum distance of the middle of such a back from a wall."""
-PATH_M = 0.6
-"""Width of a path."""
 CELL_M = 0.05
 """Edge length of the cells of the grid on which paths are found."""
 HEAD_M = 1.8
@@ -47,15 +36,6 @@ BEFORE_WINDOW_M = 0.4
 """Depth of the floor in front of a window where objects must not be higher than the sill."""
 BEFORE_WINDOWS = ("lamp", "plant")
 """Words in the names of classes that may stand or hang in front of a window."""
-
-ALIKE = 0.15
-"""Share by which the extents of two nightstands of a bed may differ."""
-
-FAULTS = (
-    "pairs_at_bed", "chairs_at_tables", "chairs_turned", "screens_seen", "fronts_free",
-    "backs_covered",
-)  # fmt: skip
-"""Checks of function that places should not fail."""
 
 
 class Zone(NamedTuple):
@@ -147,38 +127,12 @@ class PlacementRules:
                 allowed[row], enough = True, enough - 1
         return allowed, reason
 
-    def faults(self, furniture: Furniture) -> set[tuple[str, tuple[int, ...]]]:
-        """The checks of function that fail in a partly furnished room, with the rows of the objects
-        that they are about. What objects to come may mend is none."""
+    def faults(self, furniture: Furniture) -> set[Fault]:
+        """What a person would fault in a partly furnished room (`faults.py`), and what a path does
+        not lead to. What objects to come may mend is none."""
         pieces = furniture.pieces(self.classes)
-        found = findings(pieces, self.shape.floor.polygon)
-        failed = {
-            (check, each.rows)
-            for check in FAULTS
-            for each in found.get(check, [])
-            if not each.holds
-        }
-        used_from = {
-            ("path to the front", (row,)): pieces[row].before(PATH_M)
-            for row in rows_of(pieces, OPENED)
-            if pieces[row].front is not None and pieces[row].standing
-        }
-        beds = rows_of(pieces, BEDS)
-        if len(beds) == 1:
-            bed = pieces[beds[0]]
-            stands = rows_of(pieces, NIGHTSTANDS)
-            if len(stands) == 2 and not _alike(*(pieces[row] for row in stands)):
-                failed.add(("as large as the other", tuple(stands)))
-            for row in stands:
-                place = end_of_bed(bed, pieces[row])
-                if place is None or place[0] not in heads(bed):
-                    failed.add(("beside the head", (row,)))
-                else:
-                    if _turned_apart(bed, pieces[row]):
-                        failed.add(("turned as the bed", (row,)))
-                    strip = floor_beside(bed, place[1], PATH_M)
-                    used_from["path to the bedside", (row,)] = strip
-        if self._paths is not None and used_from:
+        failed = faults_of(pieces, self.shape.floor.polygon)
+        if self._paths is not None and (used_from := places_to_reach(pieces)):
             walked = self._paths.walked(furniture.boxes_m)
             failed |= {
                 key for key, strip in used_from.items() if not self._paths.meet(strip, walked)
@@ -226,19 +180,6 @@ def backed_by_walls(
     gaps_m = np.abs(((middles_m - sides_m) * inward).sum(axis=1))
     at_wall = shapely.distance(shapely.points(middles_m), shape.floor.polygon.exterior) <= WALL_M
     return np.asarray((gaps_m > FLUSH_M) | at_wall)
-
-
-def _alike(one: Piece, other: Piece) -> bool:
-    """True if no extent of a piece exceeds that of the other by more than `ALIKE`."""
-    ratios = np.array(one.size_m) / np.array(other.size_m)
-    return bool(np.abs(np.log(ratios)).max() <= np.log(1 + ALIKE))
-
-
-def _turned_apart(one: Piece, other: Piece) -> bool:
-    """True if the fronts of two pieces are known and point in different directions."""
-    if one.front is None or other.front is None:
-        return False
-    return bool(one.front @ other.front < 0.5)
 
 
 class Paths:

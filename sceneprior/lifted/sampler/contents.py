@@ -25,9 +25,9 @@ in the same direction, in the opposite one, or sideways; and the logarithm of th
 extents, along the direction to across it."""
 MOST_LOG = 1.0
 """Bound of this logarithm."""
-MEASURES = 2
-"""Number of measures of a look's footprint: the logarithm of its area, and the absolute value of
-the logarithm of the ratio of its extents."""
+MEASURES = 3
+"""Number of measures of a look's footprint: the logarithm of its area, the absolute value of the
+logarithm of the ratio of its extents, and the square of the first."""
 
 
 class Contents(nn.Module):
@@ -71,9 +71,7 @@ class Contents(nn.Module):
         self, counts: Float[Tensor, "*batch classes"], extents_m: Float[Tensor, "*batch 2"]
     ) -> Float[Tensor, "*batch classes"]:
         """Logits of the next class, or of `END`."""
-        many = torch.arange(1, MANY + 1).to(counts)
-        reached = (counts.unsqueeze(-1) >= many).to(counts).flatten(-2)
-        told = [counts, reached, counts.sum(dim=-1, keepdim=True), extents_m]
+        told = [counts, reached(counts).flatten(-2), counts.sum(dim=-1, keepdim=True), extents_m]
         logits: Tensor = self.layers(torch.cat(told, dim=-1))
         return logits.masked_fill(self.most == 0, -torch.inf)
 
@@ -125,6 +123,11 @@ class Contents(nn.Module):
         return drawn
 
 
+def reached(counts: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch many"]:
+    """The `MANY` bits of counts."""
+    return (counts.unsqueeze(-1) >= torch.arange(1, MANY + 1).to(counts)).to(counts)
+
+
 def exclusive(counts: Float[Tensor, "rooms kinds"]) -> Bool[Tensor, "kinds kinds"]:
     """Pairs of kinds of objects that no room has together, and would have if they were independent;
     a pair of a kind with itself is two objects of it. `counts` are the objects of each kind."""
@@ -150,6 +153,7 @@ class PairwisePotentials(nn.Module):
     def __init__(self, classes: int):
         super().__init__()
         self.direction_table = nn.Parameter(torch.zeros(classes, classes, RELATIONS))
+        self.facing_table = nn.Parameter(torch.zeros(classes, 3, MANY, MANY))
         self.repeat_table = nn.Parameter(torch.zeros(classes))
         self.size_table = nn.Parameter(torch.zeros(classes, 2 * classes, MANY, MEASURES))
 
@@ -181,17 +185,22 @@ class PairwisePotentials(nn.Module):
         table = self.direction_table[label.unsqueeze(1), before.object_class]
         table = table * here.unsqueeze(-1)
         directions = torch.einsum("rosf,rof->rs", features.to(table), table)
-        # Repeats: looks whose prototype another object of the class has.
+        # How many objects of the class point in the same direction, in the opposite one, and
+        # sideways, given how many it has in all: four chairs stand two by two, the fifth at an end.
         same = here & (before.object_class == label.unsqueeze(1))
+        facing = torch.einsum("rosf,ro->rsf", features[..., :3].to(table), same.to(table))
+        in_all = reached(counts.gather(1, label.unsqueeze(1))[:, 0])
+        directions = directions + torch.einsum(
+            "rsfk,rm,rfkm->rs", reached(facing), in_all, self.facing_table[label]
+        )
+        # Repeats: looks whose prototype another object of the class has.
         prototypes = F.one_hot(before.looks // POSES, looks // POSES) * same.unsqueeze(-1)
         repeated = prototypes.sum(dim=1).clamp(max=1).repeat_interleave(POSES, dim=1)
         # Sizes: the looks' footprints, given how many objects of each class the room has.
-        reached = counts.unsqueeze(-1) >= torch.arange(1, MANY + 1).to(counts)
-        table = self.size_table[label]
-        wanted = torch.einsum("rcm,rcmf->rf", reached.to(table), table)
+        wanted = torch.einsum("rcm,rcmf->rf", reached(counts), self.size_table[label])
         x, z = look_shown[:, -3], look_shown[:, -1]
         return (
             directions[:, side_of(torch.arange(looks, device=label.device), backs)]
             + self.repeat_table[label].unsqueeze(1) * repeated
-            + wanted @ torch.stack([x + z, (x - z).abs()])
+            + wanted @ torch.stack([x + z, (x - z).abs(), (x + z).square()])
         )

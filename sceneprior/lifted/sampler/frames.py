@@ -131,15 +131,23 @@ def turn_places(
 
 
 def mirror_images(
-    rooms: PosedRooms, label: Int[Tensor, " rooms"]
+    rooms: PosedRooms, label: Int[Tensor, " rooms"], backs: Int[Tensor, "rooms objects"]
 ) -> tuple[Float[Tensor, "rooms objects 2"], Bool[Tensor, "rooms objects"]]:
-    """Where the twin of each object of class `label` would stand: the centre (x, z) of its mirror
-    image about the nearest larger piece of another class, such as that of a nightstand about the
-    bed, or that of a chair about the table.
+    """Where the twin of each object of class `label` would stand, if its back is at low z: the
+    centre (x, z) of a mirror image about the nearest larger piece of another class, such as that of
+    a nightstand about the bed, or those of a chair about the table.
+
+    The image along x of an object has its back at the same side, such as the other nightstand or
+    the next chair on this side of the table; the image along z of an object with its back at high z
+    has its back at low z, such as the chair on the other side of the table.
+
+    Args:
+        backs: Side of the room towards which the back of each object points.
 
     Returns:
         The places, and whether each object has one: the class must be `label`, a larger piece must
-        stand within `BESIDE_M`, and no object of the class may stand at the image yet.
+        stand within `BESIDE_M`, the back must be at low or high z, and no object of the class may
+        stand at the image yet.
     """
     count = rooms.is_object.shape[1]
     centre, extents = rooms.boxes_m.split(3, dim=-1)
@@ -154,10 +162,9 @@ def mirror_images(
         return centre, rooms.is_object
     least, beside = gap.min(dim=-1)
     rows = torch.arange(len(away), device=away.device)[:, None], torch.arange(count), beside
-    # It moves along the axis on which the two are apart.
-    moves = gaps[..., ::2][rows] == least.unsqueeze(-1)
+    moves = torch.stack([backs == 0, backs == 2], dim=-1)  # at low z, at high z
     images = centre + 2 * away[rows] * moves
     same = rooms.is_object & (labels == label.unsqueeze(1))
     there = (images.unsqueeze(2) - centre.unsqueeze(1)).abs() < extents.unsqueeze(1) / 2
     taken = (there.all(dim=-1) & same.unsqueeze(1)).any(dim=-1)
-    return images, same & (least < BESIDE_M) & ~taken
+    return images, same & moves.any(dim=-1) & (least < BESIDE_M) & ~taken

@@ -13,7 +13,7 @@ from sceneprior.core.boxes import QUARTERS
 from sceneprior.core.mixtures import LogisticMixture, draw_index
 from sceneprior.lifted.lifting import HANGS_M
 from sceneprior.lifted.prototypes import POSES, PosedRooms, turn_posed
-from sceneprior.lifted.sampler.contents import Contents, PairwisePotentials
+from sceneprior.lifted.sampler.contents import MANY, Contents, PairwisePotentials, reached
 from sceneprior.lifted.sampler.frames import SYMMETRIES, gaps_m, rectangle_sides
 from sceneprior.lifted.sampler.placement import SHOWN, Placement, Places
 from sceneprior.paper.decoders import mlp
@@ -160,7 +160,7 @@ class RoomSampler(nn.Module):
         self.object_embedding = nn.Linear(CLASS_WIDTH + 10 * LENGTHS, width)
         self.rectangle_embedding = nn.Linear(4 * LENGTHS, width)
         self.query = nn.Parameter(torch.randn(width))
-        self.summary_embedding = nn.Linear(2 * classes + 4 * LENGTHS, width)
+        self.summary_embedding = nn.Linear((2 + MANY) * classes + 4 * LENGTHS, width)
         self.dropout = nn.Dropout(dropout)
         self.encoder = nn.ModuleList(
             nn.TransformerEncoderLayer(
@@ -229,7 +229,9 @@ class RoomSampler(nn.Module):
         low, high = rectangle_sides(rectangle_m)
         furnished = before.is_object.any(dim=1, keepdim=True)
         gaps = gaps_m(before, rectangle_m).where(furnished, torch.cat([high - low] * 2, dim=-1))
-        summary = torch.cat([self.counts(before), coming, fourier_features(gaps)], dim=-1)
+        placed = self.counts(before)
+        in_all = reached(placed + coming).flatten(-2)
+        summary = torch.cat([placed, coming, fourier_features(gaps), in_all], dim=-1)
         query = self.query + self.summary_embedding(summary)
         shown = self.rectangle_embedding(fourier_features(rectangle_m))
         features = torch.cat([query.unsqueeze(1), shown.unsqueeze(1), tokens], dim=1)

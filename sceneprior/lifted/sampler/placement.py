@@ -8,10 +8,12 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from sceneprior.core.boxes import QUARTERS, turn_boxes
 from sceneprior.core.mixtures import FIRST_SCALE, LogisticMixture
 from sceneprior.lifted.prototypes import PARTS, PosedRooms, turn_posed
+from sceneprior.lifted.sampler.contents import MANY, reached
 from sceneprior.lifted.sampler.frames import (
     gaps_to_sides_m,
     mirror_images,
@@ -44,10 +46,10 @@ lower side, centred, flush with its upper side, adjacent behind it, `APART_M` be
 and at its mirror image (`mirror_images`)."""
 APART_M = 0.4
 """Gap between an object and the two anchors apart from it."""
-SHARPNESS, SPREAD = 2.0, 0.7
-"""Sampling raises the weights of anchors to the power `SHARPNESS` and multiplies the scales by
-`SPREAD`, because distributions learnt from a few hundred rooms are broader than those of the
-rooms."""
+DRAWS, DENSER = 8, 3
+"""Sampling along an axis takes one of `DRAWS` values, the first that is among the `DENSER` of the
+highest density. Background weight of many unlikely anchors would otherwise add up: of the chairs of
+a table for four, one would stand elsewhere."""
 GAPS_M = (-0.4, -0.15, -0.05, 0.0, 0.05, 0.15, 0.4, 1.0, 2.0)
 """Knots of `ramps` for gaps; negative gaps are overlaps."""
 OFFSETS_M = (-1.5, -0.7, -0.3, -0.1, -0.03, 0.03, 0.1, 0.3, 0.7, 1.5)
@@ -55,7 +57,7 @@ OFFSETS_M = (-1.5, -0.7, -0.3, -0.1, -0.03, 0.03, 0.1, 0.3, 0.7, 1.5)
 NEAR_M = (0.05, 0.15, 0.5)
 """Distances from a mirror image at which its features become 0."""
 OF_GAP, OF_OFFSET = len(GAPS_M) - 1, len(OFFSETS_M) - 1
-OF_OBJECT, OF_SIDES = OF_GAP + 3 * OF_OFFSET + len(NEAR_M), 2 * OF_GAP
+OF_OBJECT, OF_SIDES = OF_GAP + 3 * OF_OFFSET + len(NEAR_M), 4 * OF_GAP
 """Number of features, along an axis, of the relation to an object, and of the relations to the two
 sides of the rectangle."""
 
@@ -115,16 +117,16 @@ class Places(NamedTuple):
         x, z = turn_places(place_m, self.quarters).split(1, dim=-1)
         return self._along_x().log_prob(x) + self._along_z(x[:, 0]).log_prob(z)
 
-    def draw_x(self, uniform: Float[Tensor, "rooms tries 2"]) -> Float[Tensor, "rooms tries"]:
+    def draw_x(self, uniform: Float[Tensor, "rooms tries draws 2"]) -> Float[Tensor, "rooms tries"]:
         """Sample positions along the frames' x axis. `uniform` holds the random numbers to use."""
-        return _sharpened(self._along_x()).drawn(uniform[..., 0], uniform[..., 1:])[..., 0]
+        return self._along_x().denser(uniform, DENSER)
 
     def draw(
-        self, x: Float[Tensor, " rooms"], uniform: Float[Tensor, "rooms 2"]
+        self, x: Float[Tensor, " rooms"], uniform: Float[Tensor, "rooms draws 2"]
     ) -> Float[Tensor, "rooms 2"]:
         """Sample each place's z in its frame, given its `x` there, and return both turned to the
         room's axes. `uniform` holds the random numbers to use, uniform in [0, 1)."""
-        z = _sharpened(self._along_z(x)).draw(uniform[:, 0], uniform[:, 1:])[:, 0]
+        z = self._along_z(x).denser(uniform.unsqueeze(1), DENSER)[:, 0]
         return turn_places(torch.stack([x, z], dim=-1), -self.quarters % QUARTERS)
 
     def _along_x(self) -> LogisticMixture:
@@ -134,18 +136,19 @@ class Places(NamedTuple):
 
     def _along_z(self, x: Float[Tensor, " rooms"]) -> LogisticMixture:
         anchors = self._anchors(1)
-        relations_x, sides_x, overlap_x = self._relations(0, x.unsqueeze(1))
-        relations_z, sides_z, overlap_z = self._relations(1, anchors.at_m)
+        relations_x, sides_x, gap_x = self._relations(0, x.unsqueeze(1))
+        relations_z, sides_z, gap_z = self._relations(1, anchors.at_m)
+        apart = ramps(torch.maximum(gap_x, gap_z).unsqueeze(-1), GAPS_M)
         least = torch.minimum(
             self.size_m.prod(dim=-1, keepdim=True), self.footprints_m[..., 2:].prod(dim=-1)
         )
-        shared = overlap_x * overlap_z / least.clamp(min=1e-6).unsqueeze(1)
+        shared = gap_x.clamp(max=0) * gap_z.clamp(max=0) / least.clamp(min=1e-6).unsqueeze(1)
         shared = (shared * self.meets.unsqueeze(1)).clamp(max=1).unsqueeze(-1)
         # An object is near an image only if it is so along both axes.
         relations_z[..., -len(NEAR_M) :] *= relations_x[..., -1:]
         sides = torch.cat([sides_x.expand_as(sides_z), sides_z], dim=-1)
         return self.placement.along_z(
-            self, anchors, (relations_x, relations_z, shared.sqrt()), sides
+            self, anchors, (relations_x, relations_z, apart, shared.sqrt()), sides
         )
 
     def _anchors(self, axis: int) -> Anchors:
@@ -173,7 +176,7 @@ class Places(NamedTuple):
 
     def _relations(self, axis: int, at_m: Float[Tensor, "rooms anchors"]) -> tuple[Tensor, ...]:
         """Features, along an axis, of the relations to the objects already placed and to the sides
-        of the rectangle, and the overlap with each object in metres."""
+        of the rectangle, and the gap to each object in metres, negative where they overlap."""
         size = self.size_m[:, axis].unsqueeze(1)
         offset = self.footprints_m[:, None, :, axis] - at_m.unsqueeze(-1)
         theirs = self.footprints_m[..., 2 + axis]
@@ -188,19 +191,15 @@ class Places(NamedTuple):
         ]  # fmt: skip
         middle, extent = (self.rectangle_m[:, [at]] for at in (axis, 2 + axis))
         to_middle = at_m - middle
-        sides = (
-            torch.stack([extent / 2 + to_middle, extent / 2 - to_middle], dim=-1)
-            - size[..., None] / 2
-        )
-        overlap = (-gap).clamp(min=0)
-        return torch.cat(relations, dim=-1), ramps(sides, GAPS_M), overlap
-
-
-def _sharpened(mixture: LogisticMixture) -> LogisticMixture:
-    """The mixture that is sampled from; see `SHARPNESS`."""
-    return LogisticMixture(
-        SHARPNESS * mixture.weight_logits, mixture.means, mixture.log_scales + math.log(SPREAD)
-    )
+        own = torch.stack([extent / 2 + to_middle, extent / 2 - to_middle], dim=-1)
+        own = own - size[..., None] / 2
+        # What stays free between a side and all furniture once this object stands.
+        low = self.footprints_m[..., axis] - theirs / 2 - (middle - extent / 2)
+        high = middle + extent / 2 - self.footprints_m[..., axis] - theirs / 2
+        others = torch.stack([low, high], dim=-1).masked_fill(~self.is_object[..., None], torch.inf)
+        nearest = F.pad(others, (0, 0, 0, 1), value=torch.inf).amin(dim=1, keepdim=True)
+        sides = torch.cat([own, torch.minimum(own, nearest)], dim=-1)
+        return torch.cat(relations, dim=-1), ramps(sides, GAPS_M), gap
 
 
 class AxisScore(nn.Module):
@@ -296,12 +295,13 @@ class Placement(nn.Module):
         super().__init__()
         self.class_embedding = nn.Embedding(classes, EMBEDDING)
         self.look_embedding = nn.Linear(SHOWN, EMBEDDING)
-        self.own = nn.Linear(2 * EMBEDDING + 6 + 2 * classes, WIDTH)
-        self.there = nn.Linear(2 * EMBEDDING + QUARTERS + 4 + 2 * OF_SIDES, WIDTH)
+        self.own = nn.Linear(2 * EMBEDDING + 6 + 2 * classes + 2 * MANY, WIDTH)
+        self.there = nn.Linear(2 * EMBEDDING + QUARTERS + 4 + 4 * OF_GAP, WIDTH)
         self.dropout = nn.Dropout(dropout)
         self.along_x = AxisScore(classes, OF_OBJECT, OF_SIDES, dropout)
-        # Given x, relations along both axes are known, and so is the overlap of the footprints.
-        self.along_z = AxisScore(classes, 2 * OF_OBJECT + 1, 2 * OF_SIDES, dropout)
+        # Given x, relations along both axes are known, and so are the gap between the footprints
+        # and their overlap.
+        self.along_z = AxisScore(classes, 2 * OF_OBJECT + OF_GAP + 1, 2 * OF_SIDES, dropout)
 
     def forward(
         self,
@@ -333,21 +333,27 @@ class Placement(nn.Module):
         size_m = torch.where((quarters % 2 == 1)[:, None], size_m.flip(-1), size_m)
         centre, extents = before.boxes_m.split(3, dim=-1)
         bottoms_m = centre[..., 1:2] - extents[..., 1:2] / 2
+        backs_there = side_of(looks, backs)
         to_sides = ramps(torch.cat(gaps_to_sides_m(before.boxes_m, rectangle_m), dim=-1), GAPS_M)
         there = torch.cat([
             self.class_embedding(before.object_class), self.look_embedding(look_shown[looks]),
-            torch.eye(QUARTERS).to(extents)[side_of(looks, backs)], extents, bottoms_m, to_sides,
+            torch.eye(QUARTERS).to(extents)[backs_there], extents, bottoms_m, to_sides,
         ], dim=-1)  # fmt: skip
+        # The number of objects of its class, placed and in all: four chairs stand in pairs.
+        placed, coming = counts.unflatten(-1, (2, -1)).gather(
+            -1, label[:, None, None].expand(-1, 2, 1)
+        ).unbind(dim=1)  # fmt: skip
+        alike = reached(torch.cat([placed, placed + coming], dim=-1))
         own = torch.cat([
             self.class_embedding(label), self.look_embedding(look_shown[own_look]),
-            size_m, bottom_m.unsqueeze(-1), rectangle_m[:, 2:] / 4, counts,
+            size_m, bottom_m.unsqueeze(-1), rectangle_m[:, 2:] / 4, counts, alike.flatten(1),
         ], dim=-1)  # fmt: skip
         own_box = torch.cat([centre.new_zeros(len(label), 3), size_m], dim=-1).unsqueeze(1)
         own_box[:, 0, 1] = bottom_m + size_m[:, 1] / 2
         # True if the two overlap in height; x and z are set to 0, because they do not matter.
         level = centre * torch.tensor([0.0, 1.0, 0.0]).to(centre)
         meets = shared_extents(own_box, torch.cat([level, extents], dim=-1))[..., 1] > 0
-        images_m, has_image = mirror_images(before, label)
+        images_m, has_image = mirror_images(before, label, backs_there)
         return Places(
             self, label, before.object_class,
             self.dropout(torch.relu(self.own(own))), self.dropout(torch.relu(self.there(there))),

@@ -65,23 +65,28 @@ def test_scores_are_those_of_a_plain_loop(scores, rooms):
     for row, label in enumerate(LABEL.tolist()):
         for look in range(LOOKS):
             side, total = int(side_of(torch.tensor(look), BACKS)), 0.0
-            repeats = False
+            repeats, facing = False, [0, 0, 0]
             for item in rooms.is_object[row].nonzero()[:, 0].tolist():
                 other, known = int(rooms.object_class[row, item]), rooms.looks[row, item]
                 table = scores.direction_table[label, other].tolist()
                 turn = (int(side_of(known, BACKS)) - side) % QUARTERS
-                total += table[{0: 0, 1: 2, 2: 1, 3: 2}[turn]]
+                relation = {0: 0, 1: 2, 2: 1, 3: 2}[turn]
+                total += table[relation]
+                facing[relation] += other == label
                 x, z = rooms.boxes_m[row, item, [3, 5]].tolist()
                 ratio = math.log(z / x) if side in (0, 2) else math.log(x / z)
                 total += table[3] * max(-MOST_LOG, min(MOST_LOG, ratio))
                 repeats |= other == label and int(known) // POSES == look // POSES
             total += float(scores.repeat_table[label]) * repeats
+            for relation, number in enumerate(facing):
+                reached = scores.facing_table[label, relation, :number, : int(COUNTS[row, label])]
+                total += float(reached.sum())
             x, _, z = look_shown()[look, -3:].tolist()
             for other in range(2 * CLASSES):
                 for times in range(1, MANY + 1):
                     if COUNTS[row, other] >= times:
-                        area, ratio = scores.size_table[label, other, times - 1].tolist()
-                        total += area * (x + z) + ratio * abs(x - z)
+                        area, ratio, square = scores.size_table[label, other, times - 1].tolist()
+                        total += area * (x + z) + ratio * abs(x - z) + square * (x + z) ** 2
             assert float(found[row, look]) == pytest.approx(total, abs=1e-12)
 
 
