@@ -50,7 +50,7 @@ FREE_SHARE = 0.7
 BACK_M = 0.1
 """Largest distance of a back from a wall or another piece."""
 LOW_M = 0.15
-"""Height below which a piece, such as a rug, blocks no front."""
+"""Height below which a piece, such as a rug, blocks nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,14 +208,13 @@ def at_table(chair: Piece, table: Piece) -> bool:
 
 
 def seats_at(pieces: Sequence[Piece]) -> dict[int, int]:
-    """The rows of chairs at tables, and of the table of each."""
+    """Row of each chair that stands at a table, and of its table."""
     tables, found = rows_of(pieces, TABLES), {}
-    for chair in rows_of(pieces, CHAIRS):
-        if tables:
-            apart_m = [pieces[chair].place.distance(pieces[row].place) for row in tables]
-            table = tables[int(np.argmin(apart_m))]
-            if at_table(pieces[chair], pieces[table]):
-                found[chair] = table
+    for chair in rows_of(pieces, CHAIRS) if tables else []:
+        apart_m = [pieces[chair].place.distance(pieces[row].place) for row in tables]
+        table = tables[int(np.argmin(apart_m))]
+        if at_table(pieces[chair], pieces[table]):
+            found[chair] = table
     return found
 
 

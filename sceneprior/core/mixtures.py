@@ -69,22 +69,23 @@ class LogisticMixture(NamedTuple):
         return mean + log_scale.exp() * torch.logit(place, eps=1e-6)
 
     def denser(
-        self, uniform: Float[Tensor, "*batch draws tries 2"], kept: int
-    ) -> Float[Tensor, "*batch draws"]:
-        """Sample several values per mixture of a single number, and none in its thin tails: each is
-        the first of `tries` values that is among the `kept` ones of the highest density.
+        self, uniform: Float[Tensor, "*batch values tries 2"], kept: int
+    ) -> Float[Tensor, "*batch values"]:
+        """Sample several values per mixture of a single number, with few in its sparse parts: each
+        value is the first of its `tries` that is among the `kept` ones of the highest density.
 
         `uniform` holds the choice and the place of each try; see `drawn`.
         """
         choice, place = uniform.flatten(-3, -2).split(1, dim=-1)
-        values = self.drawn(choice[..., 0], place)
+        tried = self.drawn(choice[..., 0], place)
         each = LogisticMixture(
-            *(part.unsqueeze(dim) for part, dim in zip(self, (-2, -3, -3), strict=True))
+            self.weight_logits.unsqueeze(-2),
+            self.means.unsqueeze(-3),
+            self.log_scales.unsqueeze(-3),
         )
-        density = each.log_prob(values).unflatten(-1, uniform.shape[-3:-1])
-        rank = density.argsort(dim=-1, descending=True).argsort(dim=-1)
-        first = (rank < kept).int().argmax(dim=-1, keepdim=True)
-        return values[..., 0].unflatten(-1, uniform.shape[-3:-1]).gather(-1, first)[..., 0]
+        density = each.log_prob(tried).unflatten(-1, uniform.shape[-3:-1])
+        first = density.topk(kept).indices.amin(dim=-1, keepdim=True)
+        return tried[..., 0].unflatten(-1, uniform.shape[-3:-1]).gather(-1, first)[..., 0]
 
     def draw(
         self, choice: Float[Tensor, "*batch"], place: Float[Tensor, "*batch numbers"]

@@ -156,7 +156,7 @@ def _furnish(
         given = [furniture_in(sampler, plans.rooms, room) for room in range(len(draws))]
         relations = conditions.wishes.relations
         rules = [
-            PlacementRules(shape, relations, conditions.classes, own)
+            PlacementRules(shape, relations, conditions.classes, own, number < effort.comfortable)
             for shape, own in zip(plans.shapes, given, strict=True)
             if shape is not None
         ]
@@ -188,11 +188,11 @@ def _furnish(
         good = good & ~(added & (gaps.amax(dim=-1) > OPEN_M))
     merit = good.int()
     if rules is not None:  # the room with the fewest faults
-        allowed = [len(own.faults(there)) for own, there in zip(rules, given, strict=True)]
+        allowed = [own.faults(there) for own, there in zip(rules, given, strict=True)]
         for row, own in enumerate(particles.furniture()):
-            faults = len(rules[room := int(particles.room[row])].faults(own))
-            merit[row] *= 100 - faults
-            good[row] &= number >= effort.sound or faults <= allowed[room]
+            new = rules[room := int(particles.room[row])].faults(own) - allowed[room]
+            merit[row] *= 100 - len(new)
+            good[row] &= number >= effort.sound or not new
     good, merit = (part.unflatten(0, (-1, effort.particles)) for part in (good, merit))
     best = torch.arange(len(draws)) * effort.particles + merit.argmax(dim=1)
     return particles, best.where(good.any(dim=1), -1), missing

@@ -59,14 +59,20 @@ class Effort(NamedTuple):
     leave out others without a place; the last one leaves out any."""
     sound: int
     """Attempts in which no place may add a fault of function."""
+    comfortable: int
+    """Attempts in which none may add a fault of comfort either."""
     together: int
     """Particles for which attempts are made side by side, if fewer rooms are left; the first
     successful attempt counts. A step takes about as long for one room as for these."""
 
 
-PLAIN = Effort(particles=1, attempts=48, attempts_per_plan=24, whole=47, sound=0, together=32)
+PLAIN = Effort(
+    particles=1, attempts=48, attempts_per_plan=24, whole=47, sound=0, comfortable=0, together=32
+)
 """For rooms whose conditions are inputs of the network: a rectangle, and given objects."""
-REQUESTED = Effort(particles=6, attempts=12, attempts_per_plan=1, whole=4, sound=6, together=1)
+REQUESTED = Effort(
+    particles=6, attempts=12, attempts_per_plan=1, whole=4, sound=6, comfortable=2, together=1
+)
 """For rooms with a floor, openings or wishes, which places are checked against."""
 
 

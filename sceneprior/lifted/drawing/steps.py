@@ -168,7 +168,8 @@ def place_next(
     x = (places := found.places()).draw_x(for_x)
     for number in range(TRIES):
         own = found.rows(waiting)
-        place_m = places.rows(waiting).draw(x[waiting, number], for_z[waiting, number])
+        z_numbers = for_z[waiting, number]
+        place_m = places.rows(waiting).draw(x[waiting, number], z_numbers, number == 0)
         boxes_m = own.boxes_m(place_m)
         boxes_m = resolve_overlap(boxes_m, own.state, own.apart())
         fits = violation(boxes_m, own.state, own.apart()) == 0

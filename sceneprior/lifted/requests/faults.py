@@ -1,4 +1,4 @@
-"""What a person would fault at one look in a requested room, beyond the checks of the metrics."""
+"""Faults of a requested room that a person notices at once, those of the metrics included."""
 
 from collections.abc import Iterator, Sequence
 
@@ -23,31 +23,40 @@ from sceneprior.core.arrangements import (
 )
 
 Fault = tuple[str, tuple[int, ...]]
-"""Its name, and the rows of the pieces that it is about."""
+"""A fault: its name, and the rows of the pieces that it is about."""
 ALIKE = 0.15
 """Share by which the extents of a bed's nightstands or of a table's chairs may differ."""
 PATH_M = 0.6
 """Width of a path."""
-PULLED_M = 0.35
-"""Depth of the floor behind a chair at a table, onto which it is pulled out."""
-LEGS_M = 0.3
+PULLED_M = 0.4
+"""Distance from its table to which a chair must have room to be pulled out."""
+LEGS_M = 0.2
 """Depth of the floor before a sofa that must be free."""
 SEEN_M, VIEW_M = 0.5, 0.3
 """Height from which pieces hide a screen, and width of the view of it from a seat."""
+LOW = ("coffee_table", "stool")
+"""Classes that stand before seats and screens."""
 CHECKS = (
     "pairs_at_bed", "chairs_at_tables", "chairs_turned", "screens_seen", "fronts_free",
     "backs_covered",
 )  # fmt: skip
 """Checks of function that places should not fail."""
+COMFORT = ("room to pull it out", "like the other chairs", "room for legs", "a view of the screen")
+"""Faults that a room may have if it would otherwise be furnished again and again."""
 
 
 def faults_of(pieces: Sequence[Piece], floor: shapely.Polygon) -> set[Fault]:
-    """The faults of a partly furnished room, but for those that pieces to come may mend."""
+    """The faults of a partly furnished room; those that later pieces may mend are left out."""
     found = findings(pieces, floor)
     failed = {
         (check, each.rows) for check in CHECKS for each in found.get(check, []) if not each.holds
     }
-    return failed | {*_of_bed(pieces), *_of_chairs(pieces, floor), *_of_sofas(pieces, floor)}
+    return failed | {
+        *_of_bed(pieces),
+        *_of_chairs(pieces, floor),
+        *_of_sofas(pieces, floor),
+        *_of_screens(pieces),
+    }
 
 
 def places_to_reach(pieces: Sequence[Piece]) -> dict[Fault, shapely.Polygon]:
@@ -88,39 +97,50 @@ def _of_bed(pieces: Sequence[Piece]) -> Iterator[Fault]:
 def _of_chairs(pieces: Sequence[Piece], floor: shapely.Polygon) -> Iterator[Fault]:
     """Chairs at a table that cannot be pulled out, or differ from its other chairs."""
     at = seats_at(pieces)
-    for chair, table in at.items():
-        others = [piece for row, piece in enumerate(pieces) if row != chair and piece.standing]
-        if pieces[chair].front is not None and not is_free(
-            pieces[chair].before(-PULLED_M), others, floor
-        ):
-            yield "room to pull it out", (chair,)
-        first = min(row for row, own in at.items() if own == table)
-        if not _alike(pieces[first], pieces[chair]):
-            yield "as large as the other", (first, chair)
+    for row, table in at.items():
+        chair = pieces[row]
+        more_m = PULLED_M - chair.place.distance(pieces[table].place)
+        if chair.front is not None and chair.faces(pieces[table]) and more_m > 0:
+            others = [other for other in pieces if other is not chair and other.standing]
+            if not is_free(chair.before(-more_m), others, floor):
+                yield "room to pull it out", (row,)
+        first = next(own for own in at if at[own] == table and pieces[own].label == chair.label)
+        if not _alike(pieces[first], chair):
+            yield "like the other chairs", (first, row)
 
 
 def _of_sofas(pieces: Sequence[Piece], floor: shapely.Polygon) -> Iterator[Fault]:
-    """Sofas without room for legs, and screens that other pieces hide from the seats opposite."""
-    others = [piece for piece in pieces if piece.standing]
+    """Sofas without room for legs."""
     for row in rows_of(pieces, ("sofa",)):
         sofa = pieces[row]
-        blocking = [other for other in others if other is not sofa]
+        others = [other for other in pieces if other is not sofa and other.standing]
+        blocking = [other for other in others if other.label != "stool"]
         if sofa.front is not None and not is_free(sofa.before(LEGS_M), blocking, floor):
             yield "room for legs", (row,)
+
+
+def _of_screens(pieces: Sequence[Piece]) -> Iterator[Fault]:
+    """Screens that other pieces hide from all seats opposite."""
     seats, screens = (
         [row for row in rows_of(pieces, labels) if pieces[row].front is not None]
         for labels in (SEATS, SCREENS)
     )
-    high = [piece for piece in others if piece.size_m[1] > SEEN_M]
-    for screen in screens:
+    high = [
+        piece
+        for piece in pieces
+        if piece.standing and piece.size_m[1] > SEEN_M
+        and piece.label not in (*SEATS, *SCREENS, *LOW)
+    ]  # fmt: skip
+    for row in screens:
+        screen = pieces[row]
+        hiding = [piece.place for piece in high if not piece.place.intersects(screen.place)]
         views = [
-            shapely.LineString([pieces[screen].center, pieces[seat].center]).buffer(VIEW_M / 2)
+            shapely.LineString([screen.center, pieces[seat].center]).buffer(VIEW_M / 2)
             for seat in seats
-            if opposite(pieces[screen], pieces[seat])
+            if opposite(screen, pieces[seat])
         ]
-        hiding = [piece.place for piece in high if piece.label not in (*SEATS, *SCREENS)]
         if views and all(any(place.intersects(view) for place in hiding) for view in views):
-            yield "a view of the screen", (screen,)
+            yield "a view of the screen", (row,)
 
 
 def _alike(one: Piece, other: Piece) -> bool:

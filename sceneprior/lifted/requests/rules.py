@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from sceneprior.core.arrangements import NIGHTSTANDS
 from sceneprior.core.shell import space_before
-from sceneprior.lifted.requests.faults import PATH_M, Fault, faults_of, places_to_reach
+from sceneprior.lifted.requests.faults import COMFORT, PATH_M, Fault, faults_of, places_to_reach
 from sceneprior.lifted.requests.floors import RoomShape
 from sceneprior.lifted.requests.relations import Furniture, RelationChecks, footprints
 from sceneprior.lifted.requests.wishes import RelationWish
@@ -67,6 +67,7 @@ class PlacementRules:
         wishes: Requested relations.
         classes: Names of the classes by index.
         given: Objects that stay where they are, even if no path leads to them.
+        comfort: Faults of comfort count, too.
     """
 
     def __init__(
@@ -75,8 +76,9 @@ class PlacementRules:
         wishes: Sequence[RelationWish],
         classes: Sequence[str],
         given: Furniture,
+        comfort: bool = True,
     ):
-        self.shape, self.classes = shape, classes
+        self.shape, self.classes, self.comfort = shape, classes, comfort
         self._zones = zones_of(shape)
         swings = [zone.polygon for zone in self._zones["door"]]
         self.relations = RelationChecks(wishes, shape, classes, swings)
@@ -128,10 +130,14 @@ class PlacementRules:
         return allowed, reason
 
     def faults(self, furniture: Furniture) -> set[Fault]:
-        """What a person would fault in a partly furnished room (`faults.py`), and what a path does
-        not lead to. What objects to come may mend is none."""
+        """Faults of a partly furnished room (`faults.py`), and places to which no path leads. Those
+        that later objects may mend are left out."""
         pieces = furniture.pieces(self.classes)
-        failed = faults_of(pieces, self.shape.floor.polygon)
+        failed = {
+            fault
+            for fault in faults_of(pieces, self.shape.floor.polygon)
+            if self.comfort or fault[0] not in COMFORT
+        }
         if self._paths is not None and (used_from := places_to_reach(pieces)):
             walked = self._paths.walked(furniture.boxes_m)
             failed |= {

@@ -46,10 +46,10 @@ lower side, centred, flush with its upper side, adjacent behind it, `APART_M` be
 and at its mirror image (`mirror_images`)."""
 APART_M = 0.4
 """Gap between an object and the two anchors apart from it."""
-DRAWS, DENSER = 8, 3
-"""Sampling along an axis takes one of `DRAWS` values, the first that is among the `DENSER` of the
-highest density. Background weight of many unlikely anchors would otherwise add up: of the chairs of
-a table for four, one would stand elsewhere."""
+DRAWS, DENSER = 8, 4
+"""Sampling the first place of an object draws `DRAWS` values along each axis and takes the first of
+the `DENSER` ones of highest density. Otherwise many unlikely anchors together would have enough
+weight that one of four chairs stands away from the table."""
 GAPS_M = (-0.4, -0.15, -0.05, 0.0, 0.05, 0.15, 0.4, 1.0, 2.0)
 """Knots of `ramps` for gaps; negative gaps are overlaps."""
 OFFSETS_M = (-1.5, -0.7, -0.3, -0.1, -0.03, 0.03, 0.1, 0.3, 0.7, 1.5)
@@ -58,8 +58,8 @@ NEAR_M = (0.05, 0.15, 0.5)
 """Distances from a mirror image at which its features become 0."""
 OF_GAP, OF_OFFSET = len(GAPS_M) - 1, len(OFFSETS_M) - 1
 OF_OBJECT, OF_SIDES = OF_GAP + 3 * OF_OFFSET + len(NEAR_M), 4 * OF_GAP
-"""Number of features, along an axis, of the relation to an object, and of the relations to the two
-sides of the rectangle."""
+"""Number of features, along an axis, of the relation to an object; and of the two sides of the
+rectangle: the gap to the object, and what stays free beside all furniture."""
 
 
 def ramps(lengths_m: Float[Tensor, "*batch n"], knots_m: tuple[float, ...]) -> Tensor:
@@ -118,15 +118,19 @@ class Places(NamedTuple):
         return self._along_x().log_prob(x) + self._along_z(x[:, 0]).log_prob(z)
 
     def draw_x(self, uniform: Float[Tensor, "rooms tries draws 2"]) -> Float[Tensor, "rooms tries"]:
-        """Sample positions along the frames' x axis. `uniform` holds the random numbers to use."""
-        return self._along_x().denser(uniform, DENSER)
+        """Sample positions along the frames' x axis, the first one from the denser part (`DRAWS`).
+        `uniform` holds the random numbers to use, uniform in [0, 1)."""
+        along_x = self._along_x()
+        first, others = uniform.split([1, uniform.shape[1] - 1], dim=1)
+        return torch.cat([along_x.denser(first, DENSER), along_x.denser(others, DRAWS)], dim=1)
 
     def draw(
-        self, x: Float[Tensor, " rooms"], uniform: Float[Tensor, "rooms draws 2"]
+        self, x: Float[Tensor, " rooms"], uniform: Float[Tensor, "rooms draws 2"], dense: bool
     ) -> Float[Tensor, "rooms 2"]:
         """Sample each place's z in its frame, given its `x` there, and return both turned to the
-        room's axes. `uniform` holds the random numbers to use, uniform in [0, 1)."""
-        z = self._along_z(x).denser(uniform.unsqueeze(1), DENSER)[:, 0]
+        room's axes. If `dense`, z is from the denser part, too."""
+        kept = DENSER if dense else DRAWS
+        z = self._along_z(x).denser(uniform.unsqueeze(1), kept)[:, 0]
         return turn_places(torch.stack([x, z], dim=-1), -self.quarters % QUARTERS)
 
     def _along_x(self) -> LogisticMixture:
