@@ -22,6 +22,9 @@ from sceneprior.lifted.sampler.placement import DRAWS, Places
 TRIES = 4
 """Places drawn for an object in each particle; the first allowed one is taken. With more, an object
 whose likely places are taken would end up at an unlikely one."""
+DENSE = 1
+"""Places of these that are from the denser part of their distribution where rules reject places; a
+room without rules draws all from it."""
 NUMBERS = 3 + 4 * DRAWS * TRIES
 """Uniform random numbers of a particle in a step."""
 LOOK_SHARPNESS, TWINS_SHARPNESS = 1.5, 3.0
@@ -165,11 +168,12 @@ def place_next(
     waiting, spare = torch.arange(len(rows)), dict[int, tuple[Tensor, Tensor]]()
     found = now.proposed(waiting, numbers[:, :3])
     for_x, for_z = numbers[:, 3:].unflatten(1, (2, TRIES, DRAWS, 2)).unbind(dim=1)
-    x = (places := found.places()).draw_x(for_x)
+    dense = TRIES if particles.rules is None else DENSE
+    x = (places := found.places()).draw_x(for_x, dense)
     for number in range(TRIES):
         own = found.rows(waiting)
         z_numbers = for_z[waiting, number]
-        place_m = places.rows(waiting).draw(x[waiting, number], z_numbers, number == 0)
+        place_m = places.rows(waiting).draw(x[waiting, number], z_numbers, number < dense)
         boxes_m = own.boxes_m(place_m)
         boxes_m = resolve_overlap(boxes_m, own.state, own.apart())
         fits = violation(boxes_m, own.state, own.apart()) == 0

@@ -47,9 +47,9 @@ and at its mirror image (`mirror_images`)."""
 APART_M = 0.4
 """Gap between an object and the two anchors apart from it."""
 DRAWS, DENSER = 8, 4
-"""Sampling the first place of an object draws `DRAWS` values along each axis and takes the first of
-the `DENSER` ones of highest density. Otherwise many unlikely anchors together would have enough
-weight that one of four chairs stands away from the table."""
+"""Sampling from the denser part of a distribution draws `DRAWS` values along each axis and takes
+the first of the `DENSER` ones of highest density. Otherwise many unlikely anchors together would
+have enough weight that one of four chairs stands away from the table."""
 GAPS_M = (-0.4, -0.15, -0.05, 0.0, 0.05, 0.15, 0.4, 1.0, 2.0)
 """Knots of `ramps` for gaps; negative gaps are overlaps."""
 OFFSETS_M = (-1.5, -0.7, -0.3, -0.1, -0.03, 0.03, 0.1, 0.3, 0.7, 1.5)
@@ -117,20 +117,23 @@ class Places(NamedTuple):
         x, z = turn_places(place_m, self.quarters).split(1, dim=-1)
         return self._along_x().log_prob(x) + self._along_z(x[:, 0]).log_prob(z)
 
-    def draw_x(self, uniform: Float[Tensor, "rooms tries draws 2"]) -> Float[Tensor, "rooms tries"]:
-        """Sample positions along the frames' x axis, the first one from the denser part (`DRAWS`).
-        `uniform` holds the random numbers to use, uniform in [0, 1)."""
+    def draw_x(
+        self, uniform: Float[Tensor, "rooms tries draws 2"], dense: int
+    ) -> Float[Tensor, "rooms tries"]:
+        """Sample positions along the frames' x axis, the first `dense` ones from the denser part
+        (`DRAWS`). `uniform` holds the random numbers to use, uniform in [0, 1)."""
+        first, others = uniform.split([dense, uniform.shape[1] - dense], dim=1)
         along_x = self._along_x()
-        first, others = uniform.split([1, uniform.shape[1] - 1], dim=1)
-        return torch.cat([along_x.denser(first, DENSER), along_x.denser(others, DRAWS)], dim=1)
+        every = along_x.denser(others[:, :, :1], 1)
+        return torch.cat([along_x.denser(first, DENSER), every], dim=1)
 
     def draw(
         self, x: Float[Tensor, " rooms"], uniform: Float[Tensor, "rooms draws 2"], dense: bool
     ) -> Float[Tensor, "rooms 2"]:
         """Sample each place's z in its frame, given its `x` there, and return both turned to the
         room's axes. If `dense`, z is from the denser part, too."""
-        kept = DENSER if dense else DRAWS
-        z = self._along_z(x).denser(uniform.unsqueeze(1), kept)[:, 0]
+        numbers, kept = (uniform, DENSER) if dense else (uniform[:, :1], 1)
+        z = self._along_z(x).denser(numbers.unsqueeze(1), kept)[:, 0]
         return turn_places(torch.stack([x, z], dim=-1), -self.quarters % QUARTERS)
 
     def _along_x(self) -> LogisticMixture:

@@ -133,7 +133,7 @@ def test_draws_follow_the_density(placement, given, monkeypatch):
     many = one.rows(torch.zeros(500, dtype=torch.int64))
     with torch.no_grad():
         drawn_m = torch.cat([
-            many.draw(many.draw_x(part[:, None, None, :2])[:, 0], part[:, None, 2:], False)
+            many.draw(many.draw_x(part[:, None, None, :2], 1)[:, 0], part[:, None, 2:], False)
             for part in uniform.split(500)
         ])  # fmt: skip
     drawn = log_probs(one, drawn_m)
