@@ -72,7 +72,7 @@ def test_a_drawn_room_to_its_glb(prior, tmp_path):
 
 
 def test_a_wish_to_an_answer(prior):
-    assert_short(files_of(lambda: prior.sample(1, want="two nightstands")), 35)
+    assert_short(files_of(lambda: prior.sample(1, want="two nightstands")), 36)
 
 
 def test_a_recording_to_a_shard(tmp_path):
