@@ -46,7 +46,17 @@ def test_a_refused_request_keeps_the_old_rooms(command, sampler_run, tmp_path):
 def test_rooms_that_lack_something_are_kept_and_counted(command, tmp_path, monkeypatch):
     monkeypatch.setattr(draw, "REQUESTED", draw.REQUESTED._replace(attempts=3, whole=1, sound=1))
     want = "double_bed: 1, desk: 1, single_bed: 1"
-    call = ["synthesize", "--run", "procthor-bedroom", "-n", 8, "--floor", "2.4x2.4", "--want", want]
+    call = [
+        "synthesize",
+        "--run",
+        "procthor-bedroom",
+        "-n",
+        8,
+        "--floor",
+        "2.4x2.4",
+        "--want",
+        want,
+    ]
     found = []
     for size in (2, 64):  # no room of the first task holds the request
         monkeypatch.setattr(api, "BATCH", size)
