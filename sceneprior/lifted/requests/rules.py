@@ -76,7 +76,7 @@ class PlacementRules:
         wishes: Sequence[RelationWish],
         classes: Sequence[str],
         given: Furniture,
-        comfort: bool = True,
+        comfort: bool,
     ):
         self.shape, self.classes, self.comfort = shape, classes, comfort
         self._zones = zones_of(shape)

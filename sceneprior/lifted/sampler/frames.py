@@ -133,9 +133,9 @@ def turn_places(
 def mirror_images(
     rooms: PosedRooms, label: Int[Tensor, " rooms"], backs: Int[Tensor, "rooms objects"]
 ) -> tuple[Float[Tensor, "rooms objects 2"], Bool[Tensor, "rooms objects"]]:
-    """Where the twin of each object of class `label` would stand, if its back is at low z: the
-    centre (x, z) of a mirror image about the nearest larger piece of another class, such as that of
-    a nightstand about the bed, or those of a chair about the table.
+    """Mirror images of objects of class `label`, at which a twin whose back is at low z would
+    stand: their centres (x, z). The mirror is the middle of the nearest larger piece of another
+    class, such as the bed of a nightstand or the table of a chair.
 
     The image along x of an object has its back at the same side, such as the other nightstand or
     the next chair on this side of the table; the image along z of an object with its back at high z

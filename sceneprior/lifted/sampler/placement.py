@@ -131,7 +131,8 @@ class Places(NamedTuple):
         self, x: Float[Tensor, " rooms"], uniform: Float[Tensor, "rooms draws 2"], dense: bool
     ) -> Float[Tensor, "rooms 2"]:
         """Sample each place's z in its frame, given its `x` there, and return both turned to the
-        room's axes. If `dense`, z is from the denser part, too."""
+        room's axes. If `dense`, z is from the denser part, too. `uniform` holds the random numbers
+        to use, uniform in [0, 1)."""
         numbers, kept = (uniform, DENSER) if dense else (uniform[:, :1], 1)
         z = self._along_z(x).denser(numbers.unsqueeze(1), kept)[:, 0]
         return turn_places(torch.stack([x, z], dim=-1), -self.quarters % QUARTERS)
@@ -197,13 +198,15 @@ class Places(NamedTuple):
             near * self.has_image[:, None, :, None],
         ]  # fmt: skip
         middle, extent = (self.rectangle_m[:, [at]] for at in (axis, 2 + axis))
-        to_middle = at_m - middle
-        own = torch.stack([extent / 2 + to_middle, extent / 2 - to_middle], dim=-1)
-        own = own - size[..., None] / 2
+
+        def to_sides(at_m: Tensor, size: Tensor) -> Tensor:
+            to_middle = at_m - middle
+            low_high = torch.stack([extent / 2 + to_middle, extent / 2 - to_middle], dim=-1)
+            return low_high - size.unsqueeze(-1) / 2
+
+        own, others = to_sides(at_m, size), to_sides(self.footprints_m[..., axis], theirs)
         # What stays free between a side and all furniture once this object stands.
-        low = self.footprints_m[..., axis] - theirs / 2 - (middle - extent / 2)
-        high = middle + extent / 2 - self.footprints_m[..., axis] - theirs / 2
-        others = torch.stack([low, high], dim=-1).masked_fill(~self.is_object[..., None], torch.inf)
+        others = others.masked_fill(~self.is_object.unsqueeze(-1), torch.inf)
         nearest = F.pad(others, (0, 0, 0, 1), value=torch.inf).amin(dim=1, keepdim=True)
         sides = torch.cat([own, torch.minimum(own, nearest)], dim=-1)
         return torch.cat(relations, dim=-1), ramps(sides, GAPS_M), gap

@@ -101,7 +101,7 @@ def test_new_objects_leave_the_path_to_a_given_one_if_it_has_one(barred):
     """A given bed at the far side; a given barrier before it may have no path to the bed."""
     bed, barrier = box(0, 1.0, 1, 1), box(0, -0.1, 4, 0.3)
     given = furniture([bed, barrier] if barred else [bed])
-    rules = PlacementRules(SHAPE, [], ["bed"], given)
+    rules = PlacementRules(SHAPE, [], ["bed"], given, True)
     rectangles_m = np.array([[0.0, 0.0, 4.0, 3.0]] * 2)
     places = furniture([box(0, 0.1, 4, 0.2), box(-1.6, -0.9, 0.4, 0.2)])
     allowed, _ = rules.allowed(0, places, given, [], rectangles_m, enough=2)
@@ -126,7 +126,7 @@ def test_a_wardrobe_leaves_paths_to_its_front_and_to_both_sides_of_a_bed(wardrob
     room = Furniture(np.array(boxes), np.array([0, 1, 2, 2]), np.full(4, -1), fronts)
     door = Opening("door", (-1.9, -1.5), (-1.0, -1.5), 0.0, 2.0)
     shape = RoomShape(Floor(read_floor("4x3")), (door,))
-    rules = PlacementRules(shape, [], classes, room.rows([]))
+    rules = PlacementRules(shape, [], classes, room.rows([]), True)
     failed = rules.faults(room)
     assert {row for key, (row, *_) in failed if key == "path to the bedside"} == closed
     assert (("path to the front", (0,)) in failed) == bool(closed)
