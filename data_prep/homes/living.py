@@ -44,7 +44,6 @@ EXTRAS: Offers = {
 }
 """Furniture of a living room besides sofa, coffee table, TV stand and dining table."""
 
-
 SEATS = {"seats 1": (1, 0.25), "seats 2": (2, 0.3), "sofa": (1, 0.25), "": (0, 0.2)}
 """Groups of seats around the coffee table, with their pieces and chances."""
 
@@ -74,8 +73,9 @@ def _place_sofa(room: Furnisher, groups: list[str]) -> Piece | None:
 
 
 def _coffee_table(room: Furnisher, group: str) -> Piece | None:
-    tables = room.models("coffee_table", below=0.8 * room.anchor.size_m[0])
-    return room.before(room.anchor, tables, (0.3, 0.45), angled=0.05)
+    fit = room.models("coffee_table", below=0.8 * room.anchor.size_m[0])
+    low = [model for model in fit if model.size_m[1] < 0.6 and model.size_m[2] < 1.1]
+    return room.before(room.anchor, low, (0.3, 0.45), angled=0.05)
 
 
 def _dining(room: Furnisher, group: str) -> bool:
