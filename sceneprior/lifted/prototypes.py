@@ -35,6 +35,9 @@ COARSE, PARTS = 8, 4
 """Cells along each axis of the coarse grids that are compared (`COARSE`), and of those that the
 sampler's network reads (`PARTS`)."""
 
+BLOCK = 512
+"""Objects of a class whose distances to all others are computed at a time, to save memory."""
+
 
 class Prototypes(NamedTuple):
     """Objects whose shapes represent those of all objects of their classes."""
@@ -101,7 +104,9 @@ def choose_prototypes(
     for label in np.unique(object_class[usable]):
         rows = np.flatnonzero((object_class == label) & usable)
         own = (grids[rows], sizes_m[rows])
-        apart.append((rows, pose_distances(own, own).min(axis=2)))
+        blocks = np.split(rows, range(BLOCK, len(rows), BLOCK))
+        found = [pose_distances(own, (grids[some], sizes_m[some])).min(axis=2) for some in blocks]
+        apart.append((rows, np.hstack(found)))
     alike = ALIKE
     while True:
         items, common = [], []

@@ -10,7 +10,7 @@ from rooms_of_boxes import CELLS
 from sceneprior.core.boxes import turn_grids
 from sceneprior.core.colliders import mesh_of
 from sceneprior.core.parts import SQUARE, Parts, filled_cells
-from sceneprior.lifted import prototype_decoder
+from sceneprior.lifted import prototype_decoder, prototypes
 from sceneprior.lifted.prototype_decoder import PrototypeConfig
 from sceneprior.lifted.prototypes import (
     POSES,
@@ -45,6 +45,19 @@ def test_one_object_in_all_its_poses_is_one_prototype():
     for pose in range(POSES):
         assert np.allclose(shown[pose][-3:], np.log(sizes[pose]))
         assert np.allclose(shown[pose][:-3], pooled(grids[pose : pose + 1], 4).ravel())
+
+
+def test_prototypes_do_not_depend_on_the_blocks_of_distances(monkeypatch):
+    rng = np.random.default_rng(1)
+    kinds = rng.random((3, CELLS, CELLS, CELLS)) < 0.5
+    of, labels = rng.integers(3, size=12), rng.integers(1, 3, size=12)
+    grids = kinds[of] ^ (rng.random((12, CELLS, CELLS, CELLS)) < 0.02)
+    given = grids, rng.uniform(0.9, 1.1, (12, 3)), labels, np.arange(12) != 5, 99
+    whole = choose_prototypes(*given)
+    monkeypatch.setattr(prototypes, "BLOCK", 2)
+    for found, wanted in zip(choose_prototypes(*given), whole, strict=True):
+        assert found.tolist() == wanted.tolist()
+    assert 5 <= len(whole[0]) <= 6 and whole[1].any()
 
 
 def test_distances_are_those_of_a_loop():

@@ -285,9 +285,10 @@ def descend(
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def count_wrong(
-    starts, spans, hits, kinds, lows, highs, first_solids, corners, first_corners, wrong
+    starts, spans, hits, kinds, lows, highs, first_solids, corners, first_corners, most, wrong
 ):  # fmt: skip
-    """Set `wrong` to the number of rays that each of several objects explains wrongly.
+    """Set `wrong` to the number of rays that each of several objects explains wrongly; counting of
+    object i stops at a number above `most[i]`.
 
     Object i is the union of the solids `first_solids[i]` to `first_solids[i + 1]`, cut to the
     outline of the corners `first_corners[i]` to `first_corners[i + 1]` (one past the last). Rays,
@@ -299,6 +300,8 @@ def count_wrong(
         if spans[ray, 0] == 0 and spans[ray, 1] == 0 and spans[ray, 2] == 0:
             continue
         for item in range(len(wrong)):
+            if wrong[item] > most[item]:
+                continue
             outline = corners[first_corners[item] : first_corners[item + 1]]
             near, far = within(starts[ray], spans[ray], outline)
             met = False

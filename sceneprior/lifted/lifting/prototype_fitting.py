@@ -1,5 +1,6 @@
 """Fits the parts of each prototype, and finds the look that best explains each object's rays."""
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -122,15 +123,41 @@ def explain_rays(
                 continue
             own, solids = offered[label]
             asked = RayPool(*(part[item, :ASKED] for part in rays))
-            wrong = np.empty((len(own), POSES))
-            counts = np.empty(len(own), np.int64)
-            for pose in range(POSES):
-                count_wrong(*as_prototype(asked, pose), *solids, counts)
-                sizes = turned_extents(np.log(prototypes.sizes_m[own]), pose)
-                differ = np.abs(np.log(sizes_m[item]) - sizes).sum(axis=1)
-                wrong[:, pose] = counts / ASKED + SIZE_WEIGHT * differ
-            row, pose = divmod(int(wrong.argmin()), POSES)
-            looks[item], errors[item] = own[row] * POSES + pose, wrong[row]
+            posed = [as_prototype(asked, pose) for pose in range(POSES)]
+            sizes = [turned_extents(np.log(prototypes.sizes_m[own]), pose) for pose in range(POSES)]
+            differ = SIZE_WEIGHT * np.abs(np.log(sizes_m[item]) - sizes).sum(axis=2).T
+            row = int(differ.argmin()) // POSES
+            best = _errors(posed, differ, solids, row, row + 1, np.inf).min()
+            found = _errors(posed, differ, solids, 0, len(own), best)
+            row = int(found.argmin()) // POSES
+            errors[item] = _errors(posed, differ, solids, row, row + 1, np.inf)
+            looks[item] = own[row] * POSES + int(found[row].argmin())
 
     in_threads(ask_some, len(looks))
     return looks, errors
+
+
+def _errors(
+    posed: Sequence[RayPool],
+    differ: Float[np.ndarray, "prototypes poses"],
+    solids: tuple[np.ndarray, ...],
+    start: int,
+    stop: int,
+    best: float,
+) -> Float[np.ndarray, "some poses"]:
+    """Errors of the prototypes from `start` to before `stop` in all poses. Those larger than
+    `best`, or than a smaller error in an earlier pose, are infinite and take little time; an
+    infinite `best` gives all errors."""
+    kinds, lows, highs, first, corners, first_corners = solids
+    found = differ[start:stop].copy()
+    counts = np.empty(stop - start, np.int64)
+    for pose, rays in enumerate(posed):
+        most = np.ceil((best - found[:, pose]) * ASKED)
+        count_wrong(
+            *rays, kinds, lows, highs, first[start : stop + 1], corners,
+            first_corners[start : stop + 1], most, counts,
+        )  # fmt: skip
+        found[:, pose] += np.where(counts > most, np.inf, counts / ASKED)
+        if best < np.inf:
+            best = min(best, found[:, pose].min())
+    return found

@@ -125,3 +125,29 @@ def test_objects_in_all_poses_teach_one_kind_and_are_known_again_by_their_rays()
     assert (looks[POSES:] // POSES == 1).all()
     nobody, _ = explain_rays(kinds, rays, sizes_m, np.full(10, 3), MARGIN)
     assert (nobody == -1).all(), "no prototype of this class"
+
+
+def test_looks_are_those_of_the_smallest_of_all_errors():
+    """Of each object with each prototype alone: nothing is left out."""
+    rng = np.random.default_rng(3)
+    parts, count = (CORNER, TABLE, boxes((0, 64, 0, 64, 0, 64)), CORNER), 24
+    pools = [rays_of(parts[row % 3], 200, row) for row in range(count)]
+    rays = RayPool(*(np.stack(part) for part in zip(*pools, strict=True)))
+    rays.hits[:] ^= rng.random(rays.hits.shape) < 0.2
+    sizes_m, classes = rng.uniform(0.4, 1.2, (count, 3)), np.ones(count, np.int64)
+    prototypes_m = rng.uniform(0.4, 1.2, (4, 3))
+    prototypes_m[3] = prototypes_m[0]  # ties give the first
+    grids = np.stack([filled_cells(each, CELLS, MARGIN) for each in parts])
+
+    def kinds(rows: list[int]) -> Prototypes:
+        return Prototypes(
+            tuple(parts[row] for row in rows), grids[rows], prototypes_m[rows],
+            np.ones(len(rows), np.int64), np.ones(len(rows), bool),
+        )  # fmt: skip
+
+    looks, errors = explain_rays(kinds([0, 1, 2, 3]), rays, sizes_m, classes, MARGIN)
+    alone = [explain_rays(kinds([row]), rays, sizes_m, classes, MARGIN)[1] for row in range(4)]
+    every = np.stack(alone, axis=1)
+    assert np.array_equal(looks, every.reshape(count, -1).argmin(axis=1))
+    assert np.array_equal(errors, every[np.arange(count), looks // POSES])
+    assert len(np.unique(looks // POSES)) == 3

@@ -116,9 +116,15 @@ def test_wrong_rays_of_several_objects_are_counted_at_once():
     corners = np.concatenate([SQUARE, SQUARE, half]) * 2 / MARGIN
     count_wrong(
         rays.starts, rays.spans, rays.hits, kinds, lows, highs, first, corners,
-        np.array([0, 4, 8, 12]), wrong,
+        np.array([0, 4, 8, 12]), np.full(3, np.inf), wrong,
     )  # fmt: skip
     assert wrong[0] == 0
+    stopped = np.empty(3, np.int64)
+    count_wrong(
+        rays.starts, rays.spans, rays.hits, kinds, lows, highs, first, corners,
+        np.array([0, 4, 8, 12]), np.array([0.0, 20.0, -3.0]), stopped,
+    )  # fmt: skip
+    assert stopped.tolist() == [0, 21, 0]
     starts, spans = (part * MARGIN / 2 for part in (rays.starts, rays.spans))
     known = np.abs(spans).sum(axis=1) > 0
     for item, ends in ((1, whole[0]), (2, whole[0].clip(max=[[0], [1], [1]]))):
