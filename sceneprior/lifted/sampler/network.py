@@ -21,7 +21,7 @@ from sceneprior.training.method import TrainConfig
 
 CLASS_WIDTH = 32
 """Dimension of the class embedding."""
-RECTANGLES = 6
+RECTANGLES = 12
 """Components of the Gaussian mixture of the rectangle around a room's furniture."""
 EXTENTS = 4
 """Components of the logistic mixture of an object's extents."""

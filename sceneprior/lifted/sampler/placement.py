@@ -40,17 +40,18 @@ BY_SIDES = 8
 """Number of anchors along an axis given by the room: a narrow and a wide one at each of four
 positions. These are flush with the lower side of the rectangle, flush with its upper side, in its
 middle, and at the origin, which is the middle of the floor."""
-BY_OBJECT = 8
+BY_OBJECT = 10
 """Number of anchors along an axis per object already placed: adjacent before it, flush with its
 lower side, centred, flush with its upper side, adjacent behind it, `APART_M` before and behind it,
-and at its mirror image (`mirror_images`)."""
+midway between it and the lower and the upper side of the rectangle, and at its mirror image
+(`mirror_images`)."""
 APART_M = 0.4
 """Gap between an object and the two anchors apart from it."""
 DRAWS, DENSER = 8, 4
 """Sampling from the denser part of a distribution draws `DRAWS` values along each axis and takes
 the first of the `DENSER` ones of highest density. Otherwise many unlikely anchors together would
 have enough weight that one of four chairs stands away from the table."""
-GAPS_M = (-0.4, -0.15, -0.05, 0.0, 0.05, 0.15, 0.4, 1.0, 2.0)
+GAPS_M = (-0.4, -0.15, -0.05, 0.0, 0.05, 0.15, 0.4, 0.7, 1.0, 1.5, 2.0)
 """Knots of `ramps` for gaps; negative gaps are overlaps."""
 OFFSETS_M = (-1.5, -0.7, -0.3, -0.1, -0.03, 0.03, 0.1, 0.3, 0.7, 1.5)
 """Knots of `ramps` for offsets of centres and sides."""
@@ -82,7 +83,7 @@ class Anchors(NamedTuple):
     exists: Bool[Tensor, "rooms anchors"]
     """False for the anchors of padding."""
     kind: Int[Tensor, " anchors"]
-    """0 to 7 for anchors given by the room, 8 to 15 for anchors of an object."""
+    """0 to 7 for anchors given by the room, 8 to 17 for anchors of an object."""
 
 
 class Places(NamedTuple):
@@ -172,13 +173,19 @@ class Places(NamedTuple):
             [-total, -difference, torch.zeros_like(total), difference, total,
              -total - APART_M, total + APART_M], dim=-1,
         )  # fmt: skip
-        beside = torch.cat([centre.unsqueeze(-1) + away, self.images_m[..., axis, None]], dim=-1)
-        theirs = self.is_object.unsqueeze(-1).repeat(1, 1, BY_OBJECT)
-        theirs[..., -1] &= self.has_image
+        low_m, high_m = (middle - extent / 2).unsqueeze(1), (middle + extent / 2).unsqueeze(1)
+        before_m, behind_m = centre - theirs / 2, centre + theirs / 2
+        midway = [(low_m + before_m) / 2, (behind_m + high_m) / 2]
+        has_room = torch.stack([before_m - low_m, high_m - behind_m], dim=-1) >= size[:, None, None]
+        beside = torch.cat([
+            centre.unsqueeze(-1) + away, torch.stack([*midway, self.images_m[..., axis]], dim=-1)
+        ], dim=-1)  # fmt: skip
+        exists = self.is_object.unsqueeze(-1).repeat(1, 1, BY_OBJECT)
+        exists[..., -3:] &= torch.cat([has_room, self.has_image.unsqueeze(-1)], dim=-1)
         kinds = torch.arange(BY_SIDES + BY_OBJECT, device=size.device)
         return Anchors(
             torch.cat([sides, beside.flatten(1)], dim=1),
-            torch.cat([torch.ones_like(sides, dtype=torch.bool), theirs.flatten(1)], dim=1),
+            torch.cat([torch.ones_like(sides, dtype=torch.bool), exists.flatten(1)], dim=1),
             torch.cat([kinds[:BY_SIDES], kinds[BY_SIDES:].repeat(centre.shape[1])]),
         )
 
@@ -235,7 +242,7 @@ class AxisScore(nn.Module):
         self.out = nn.Linear(WIDTH, 3)
         scales_m = (
             [NARROW_M, WIDE_M] * (BY_SIDES // 2)
-            + [NARROW_M] * (BY_OBJECT - 3) + [WIDE_M] * 2 + [NARROW_M]
+            + [NARROW_M] * (BY_OBJECT - 5) + [WIDE_M] * 2 + [NARROW_M] * 3
         )  # fmt: skip
         first = torch.tensor([math.log(scale_m / FIRST_SCALE) for scale_m in scales_m])
         self.first_log_scale: Tensor
@@ -291,10 +298,11 @@ class Placement(nn.Module):
 
     Both factors are mixtures of logistics around anchors. The room gives anchors flush with a side
     of the rectangle, in the middle of the rectangle, and in the middle of the floor. Every object
-    already placed gives anchors adjacent to it, flush with its sides, centred on it, and apart from
-    it, and one at its mirror image about the larger piece beside it. So an object can stand flush
-    with a wall along one axis and adjacent to another object along the other. The weight of an
-    anchor depends on the neighbours of an object at the anchor (`AxisScore`).
+    already placed gives anchors adjacent to it, flush with its sides, centred on it, apart from it,
+    and midway between it and the sides of the rectangle, and one at its mirror image about the
+    larger piece beside it. So an object can stand flush with a wall along one axis and adjacent to
+    another object along the other. The weight of an anchor depends on the neighbours of an object
+    at the anchor (`AxisScore`).
 
     Args:
         classes: Size of the label set.

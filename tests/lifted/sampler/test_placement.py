@@ -75,6 +75,34 @@ def test_places_turn_with_the_room(placement, given, quarters):
     assert_close(there.log_prob(turn_places(place_m, by)), plain, rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("axis", ["x", "z"])
+def test_anchors_are_midway_between_objects_and_sides_where_it_fits(placement, given, axis):
+    """In a frame turned by no quarter: the look's back is at low z."""
+    rooms, _, size_m, rectangle_m = given
+    size_m, rectangle_m = size_m * 0 + 1.0, rectangle_m + torch.tensor([0, 0, 0, 0.5]).double()
+    calls = []
+    score = placement.along_x if axis == "x" else placement.along_z
+    with score.register_forward_hook(lambda _, given, found: calls.append(given)):
+        places = distribution(placement, rooms, torch.zeros(3).long(), size_m, rectangle_m)
+        places.log_prob(torch.zeros(3, 2).double())
+    anchors, at = calls[0][1], "xz".index(axis)
+    low, high = (
+        (rectangle_m[0, at] + sign * rectangle_m[0, 2 + at] / 2).item() for sign in (-1, 1)
+    )
+    for room, item in ((0, 0), (0, 1), (1, 0), (2, 0), (2, 1)):
+        centre, extent = rooms.boxes_m[room, item, [2 * at, 3 + 2 * at]].tolist()
+        first, last = centre - extent / 2, centre + extent / 2
+        for kind, middle, free in (
+            (15, (low + first) / 2, first - low), (16, (last + high) / 2, high - last)
+        ):  # fmt: skip
+            column = int((anchors.kind == kind).nonzero()[item])
+            assert anchors.at_m[room, column].item() == pytest.approx(middle)
+            there = bool(rooms.is_object[room, item]) and free >= 1
+            assert bool(anchors.exists[room, column]) == there
+    midway = anchors.exists[:, (anchors.kind == 15) | (anchors.kind == 16)]
+    assert midway.any() and not midway.all()
+
+
 def log_probs(one: Places, places_m: torch.Tensor) -> torch.Tensor:
     """Log-densities of many places in one room, in parts that need little memory."""
     with torch.no_grad():
