@@ -81,7 +81,7 @@ class Furnisher:
         clearance: float = 0.0,
         crowding: bool = False,
     ) -> Piece | None:
-        for _ in range(tries):
+        for _ in range(tries if models else 0):
             piece = propose(self.pick(models))
             if piece and self.layout.add(piece, clearance, crowding):
                 return piece

@@ -61,8 +61,9 @@ def teach(sampler: RoomSampler, rooms: SamplerRooms) -> None:
         getattr(sampler, name)[: len(values)] = values
     generator = torch.Generator().manual_seed(0)
     furnished = here.any(dim=1)
-    frames = torch.cat([frames_of(rooms.rooms, generator) for _ in range(FRAMES)])
-    centre, extents = frames[furnished.repeat(FRAMES)].split(2, dim=-1)
+    times = max(FRAMES, RECTANGLES // int(furnished.sum()))  # as many rows as components at least
+    frames = torch.cat([frames_of(rooms.rooms, generator) for _ in range(times)])
+    centre, extents = frames[furnished.repeat(times)].split(2, dim=-1)
     mixture = GaussianMixture(RECTANGLES, reg_covar=LEAST_VARIANCE, random_state=0).fit(
         torch.cat([centre, extents.log()], dim=-1).numpy()
     )

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from rooms_of_boxes import CLASSES, lifted_rooms, sampler_rooms
+from rooms_of_boxes import CLASSES, lifted_rooms, sampler_rooms, small_sampler
 from torch.testing import assert_close
 
 from sceneprior.core.boxes import turn_boxes
@@ -139,3 +139,9 @@ def test_classes_may_meet_that_do_often_enough():
     lifted.its_boxes[1].centers_m[2] += 5
     lifted.its_boxes[3].centers_m[2] += 5
     assert not with_looks(lifted).may_meet(CLASSES).any()
+
+
+def test_a_single_room_has_enough_rectangles_for_all_components():
+    sampler = small_sampler(sampler_rooms(1))
+    drawn_m = sampler.rectangles(torch.rand(50), torch.randn(50, 4))
+    assert_close(drawn_m.mean(dim=0), rectangles_of(sampler_rooms(1).rooms)[0], atol=0.4, rtol=0)
