@@ -128,7 +128,7 @@ def test_objects_in_all_poses_teach_one_kind_and_are_known_again_by_their_rays()
 
 
 def test_looks_are_those_of_the_smallest_of_all_errors():
-    """Of each object with each prototype alone: nothing is left out."""
+    """Looks agree with the errors of each object with each prototype alone."""
     rng = np.random.default_rng(3)
     parts, count = (CORNER, TABLE, boxes((0, 64, 0, 64, 0, 64)), CORNER), 24
     pools = [rays_of(parts[row % 3], 200, row) for row in range(count)]
