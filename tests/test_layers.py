@@ -46,7 +46,7 @@ BUDGET = {
     "sceneprior/render": (4629, 23),
     "sceneprior/training": (1585, 9),
     "sceneprior/paper": (2771, 13),
-    "sceneprior/lifted": (9107, 45),
+    "sceneprior/lifted": (9143, 46),
     "sceneprior/baselines": (2926, 14),
     "sceneprior/evaluation": (4444, 21),
     "sceneprior/interchange": (912, 5),
