@@ -33,7 +33,7 @@ from sceneprior.core.wall_lines import Wall, find_ceiling, find_walls
 from sceneprior.lifted.lifting import HANGS_M, LiftedBoxes, RayPool, ShapeGrid
 from sceneprior.lifted.prototypes import Prototypes, choose_prototypes, turn_posed
 
-VERSION = 6
+VERSION = 7
 """Version of the cached boxes, hulls, rays and walls. Increase a version when results change."""
 PARTS_VERSION = 1
 """Version of the cached parts: increase it when `prototype_fitting.py`, `part_fit.py` and what it

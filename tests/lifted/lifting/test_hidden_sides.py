@@ -7,7 +7,8 @@ from sceneprior.core.cameras import Pinhole, look_at
 from sceneprior.core.observations import observe
 from sceneprior.core.wall_lines import Wall
 from sceneprior.lifted.lifting.boxes import lift_boxes
-from sceneprior.lifted.lifting.hidden_sides import planes_of
+from sceneprior.lifted.lifting.hidden_sides import moved_to_planes, planes_of
+from sceneprior.lifted.lifting.hulls import Sightings
 from sceneprior.render.appearance import box_mesh
 from sceneprior.render.offscreen import SoftwareRenderer
 
@@ -19,15 +20,20 @@ FRONT = [(x, y, z) for x in (-0.45, 0.0, 0.45) for y in (1.2, 1.7) for z in (0.5
 """Cameras that see a piece at the wall from its front alone."""
 
 
-def sides_of(low, high, eyes, planes):
-    """Lower and upper corner of the lifted box of a box that cameras see."""
+def views_of(low, high, eyes):
+    """Views of a box from cameras that look at its middle."""
     low, high = np.array(low), np.array(high)
     middle, K = (low + high) / 2, np.array([[90, 0, 80], [0, 90, 60], [0, 0, 1.0]])
     poses = np.stack([look_at(np.array(eye, dtype=float), middle) for eye in eyes])
     cameras = [Pinhole(pose, K) for pose in poses]
     meshes = [box_mesh(tuple(middle), tuple(high - low))]
     ids = SoftwareRenderer().instance_ids_of_views(meshes, cameras, SIZE).astype(np.uint8)
-    found = lift_boxes(observe(ids, [1]).room_views("room", poses, K), planes)
+    return observe(ids, [1]).room_views("room", poses, K)
+
+
+def sides_of(low, high, eyes, planes):
+    """Lower and upper corner of the lifted box of a box that cameras see."""
+    found = lift_boxes(views_of(low, high, eyes), planes)
     half_m = found.sizes_m[0] / 2
     return np.array([found.centers_m[0] - half_m, found.centers_m[0] + half_m])
 
@@ -59,6 +65,17 @@ def test_lamps_reach_the_ceiling_and_pieces_high_on_a_wall_do_not():
     found = sides_of(low, high, FRONT, PLANES)
     assert found[0, 1] == pytest.approx(1.8, abs=0.06), "it does not reach the floor either"
     assert found[1, 1] == pytest.approx(CEILING_M - 0.2, abs=0.06)
+
+
+def test_a_thin_piece_in_the_line_of_a_wall_keeps_a_depth():
+    """Its back alone is moved, and by more than the piece is deep."""
+    sides_m = np.array([[-0.3, 0, WALL_Z - 0.045], [0.3, 0.5, WALL_Z - 0.005]])
+    seen = Sightings.of(views_of(*sides_m, FRONT), 0)
+    found = moved_to_planes(seen, sides_m, PLANES)
+    np.testing.assert_allclose(found[:, 2], [WALL_Z - 0.025, WALL_Z - 0.005])
+    np.testing.assert_array_equal(found[:, :2], sides_m[:, :2])
+    deep = sides_m + np.array([[0, 0, 0], [0, 0, 0.1]])
+    np.testing.assert_allclose(moved_to_planes(seen, deep, PLANES)[0, 2], WALL_Z + 0.02)
 
 
 def test_walls_near_each_other_are_one_plane_and_oblique_ones_move_nothing():
