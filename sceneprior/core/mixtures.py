@@ -14,6 +14,9 @@ accurate to the centimetre, and without a minimum the density is unbounded where
 value."""
 MOST_SCALE = 3.0
 """Maximum scale of a logistic."""
+COMPARED_SCALE = 0.3
+"""Minimum scale with which `denser` compares densities: how much lies around a value, so that a
+narrow peak does not outweigh a broad component with as much in it."""
 FIRST_SCALE = 0.3
 """Scale for a network output of 0."""
 
@@ -72,7 +75,8 @@ class LogisticMixture(NamedTuple):
         self, uniform: Float[Tensor, "*batch values tries 2"], kept: int
     ) -> Float[Tensor, "*batch values"]:
         """Sample several values per mixture of a single number, with few in its sparse parts: each
-        value is the first of its `tries` that is among the `kept` ones of the highest density.
+        value is the first of its `tries` that is among the `kept` ones of the highest density, of
+        the mixture with scales of at least `COMPARED_SCALE`.
 
         `uniform` holds the choice and the place of each try; see `drawn`.
         """
@@ -81,7 +85,7 @@ class LogisticMixture(NamedTuple):
         each = LogisticMixture(
             self.weight_logits.unsqueeze(-2),
             self.means.unsqueeze(-3),
-            self.log_scales.unsqueeze(-3),
+            self.log_scales.unsqueeze(-3).clamp(min=math.log(COMPARED_SCALE)),
         )
         density = each.log_prob(tried).unflatten(-1, uniform.shape[-3:-1])
         first = density.topk(kept).indices.amin(dim=-1, keepdim=True)

@@ -48,20 +48,32 @@ def test_draws_follow_the_density():
 
 
 def test_denser_draws_are_the_first_of_the_densest_tries():
+    """By the density of the mixture whose scales are at least 0.3."""
     torch.manual_seed(1)
     mixture = LogisticMixture.of(torch.randn(5, 9), 1)
+    assert (mixture.log_scales < np.log(0.3)).any()
     uniform = torch.rand(5, 3, 6, 2)
     found = mixture.denser(uniform, 2)
     for row in range(5):
         one = LogisticMixture(*(part[row] for part in mixture))
+        broad = one._replace(log_scales=one.log_scales.clamp(min=float(np.log(0.3))))
         for draw in range(3):
             values = [one.draw(choice, place[None]) for choice, place in uniform[row, draw]]
-            density = [float(one.log_prob(value)) for value in values]
+            density = [float(broad.log_prob(value)) for value in values]
             best = sorted(density)[-2:]
             kept = [value for value, own in zip(values, density, strict=True) if own in best]
             assert_close(found[row, draw], kept[0][0])
     every = mixture.denser(uniform, 6)
     assert_close(every, mixture.denser(uniform[:, :, :1], 1))
+
+
+def test_denser_draws_keep_a_broad_component_with_as_much_in_it():
+    """Half of the values are in a peak 2 cm wide, half along three metres."""
+    logits, means = torch.zeros(4000, 2), torch.tensor([[[0.0], [5.0]]]).expand(4000, -1, -1)
+    scales = torch.tensor([[[0.01], [0.8]]]).log().expand(4000, -1, -1)
+    uniform = torch.rand(4000, 1, 8, 2, generator=torch.Generator().manual_seed(0))
+    found = LogisticMixture(logits, means, scales).denser(uniform, 4)
+    assert 0.05 < float((found > 2).float().mean()) < 0.5
 
 
 def test_gradients_are_right():
