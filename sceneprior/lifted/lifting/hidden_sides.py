@@ -24,8 +24,8 @@ CLOSE_M = 0.05
 FAR_M = 1.0
 """Distance from a wall or the floor beyond which no hidden side is moved to it."""
 LEAST_M = 0.02
-"""Smallest extent of an object, one of whose sides is moved: one that stands in a wall's line could
-otherwise lose all of its depth."""
+"""Extent that an object keeps when one of its sides is moved inwards, unless it has less: one that
+stands in a wall's line could otherwise lose all of its depth."""
 HIDDEN = 0.75
 """Share of the cells between a side and a plane that must be hidden behind the object."""
 CELLS = 8
@@ -79,6 +79,6 @@ def moved_to_planes(
                 continue
         at_wall |= axis != 1
         moved_m = outwards * sides_m[end, axis] + gap_m - (AT_WALL_M if axis != 1 else 0)
-        least_m = outwards * sides_m[1 - end, axis] + LEAST_M
+        least_m = outwards * sides_m[1 - end, axis] + min(LEAST_M, np.ptp(sides_m[:, axis]))
         sides_m[end, axis] = outwards * max(moved_m, least_m)
     return sides_m

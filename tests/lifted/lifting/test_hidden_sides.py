@@ -68,12 +68,14 @@ def test_lamps_reach_the_ceiling_and_pieces_high_on_a_wall_do_not():
 
 
 def test_a_thin_piece_in_the_line_of_a_wall_keeps_a_depth():
-    """Its back alone is moved, and by more than the piece is deep."""
+    """Its back would be moved by more than the piece is deep. A mat of 1 cm stays as it is."""
     sides_m = np.array([[-0.3, 0, WALL_Z - 0.045], [0.3, 0.5, WALL_Z - 0.005]])
     seen = Sightings.of(views_of(*sides_m, FRONT), 0)
     found = moved_to_planes(seen, sides_m, PLANES)
     np.testing.assert_allclose(found[:, 2], [WALL_Z - 0.025, WALL_Z - 0.005])
     np.testing.assert_array_equal(found[:, :2], sides_m[:, :2])
+    mat_m = np.array([[-0.3, 0, 0.5], [0.3, 0.01, 1.0]])
+    np.testing.assert_array_equal(moved_to_planes(seen, mat_m, PLANES), mat_m)
     deep = sides_m + np.array([[0, 0, 0], [0, 0, 0.1]])
     np.testing.assert_allclose(moved_to_planes(seen, deep, PLANES)[0, 2], WALL_Z + 0.02)
 
