@@ -41,12 +41,12 @@ MAY_TOO = {
 
 BUDGET = {
     "data_prep": (12717, 60),
-    "sceneprior/core": (6695, 30),
+    "sceneprior/core": (6691, 30),
     "sceneprior/furniture": (591, 4),
     "sceneprior/render": (4629, 23),
     "sceneprior/training": (1585, 9),
     "sceneprior/paper": (2771, 13),
-    "sceneprior/lifted": (9148, 46),
+    "sceneprior/lifted": (9107, 45),
     "sceneprior/baselines": (2926, 14),
     "sceneprior/evaluation": (4444, 21),
     "sceneprior/interchange": (912, 5),

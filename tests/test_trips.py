@@ -68,11 +68,11 @@ def test_a_mask_to_its_gradient(toy_shards, monkeypatch):
 
 def test_a_drawn_room_to_its_glb(prior, tmp_path):
     room = tmp_path / "room.glb"
-    assert_short(files_of(lambda: sceneprior.save(prior.sample(1)[0], room)), 31)
+    assert_short(files_of(lambda: sceneprior.save(prior.sample(1)[0], room)), 30)
 
 
 def test_a_wish_to_an_answer(prior):
-    assert_short(files_of(lambda: prior.sample(1, want="two nightstands")), 37)
+    assert_short(files_of(lambda: prior.sample(1, want="two nightstands")), 36)
 
 
 def test_a_recording_to_a_shard(tmp_path):

@@ -14,11 +14,8 @@ accurate to the centimetre, and without a minimum the density is unbounded where
 value."""
 MOST_SCALE = 3.0
 """Maximum scale of a logistic."""
-COMPARED_SCALE = 0.3
-"""Minimum scale with which `denser` compares densities: how much lies around a value, so that a
-narrow peak does not outweigh a broad component with as much in it."""
 FIRST_SCALE = 0.3
-"""Scale for a network output of 0."""
+"""Scale for a network output of 0, and the smallest one with which `denser` compares densities."""
 
 
 class LogisticMixture(NamedTuple):
@@ -75,8 +72,7 @@ class LogisticMixture(NamedTuple):
         self, uniform: Float[Tensor, "*batch values tries 2"], kept: int
     ) -> Float[Tensor, "*batch values"]:
         """Sample several values per mixture of a single number, with few in its sparse parts: each
-        value is the first of its `tries` that is among the `kept` ones of the highest density, of
-        the mixture with scales of at least `COMPARED_SCALE`.
+        is the first of the `kept` densest of its `tries`. Peaks count as if `FIRST_SCALE` wide.
 
         `uniform` holds the choice and the place of each try; see `drawn`.
         """
@@ -85,7 +81,7 @@ class LogisticMixture(NamedTuple):
         each = LogisticMixture(
             self.weight_logits.unsqueeze(-2),
             self.means.unsqueeze(-3),
-            self.log_scales.unsqueeze(-3).clamp(min=math.log(COMPARED_SCALE)),
+            self.log_scales.unsqueeze(-3).clamp(min=math.log(FIRST_SCALE)),
         )
         density = each.log_prob(tried).unflatten(-1, uniform.shape[-3:-1])
         first = density.topk(kept).indices.amin(dim=-1, keepdim=True)

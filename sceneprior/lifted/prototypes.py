@@ -109,17 +109,16 @@ def choose_prototypes(
         apart.append((rows, np.hstack(found)))
     alike = ALIKE
     while True:
-        items, common = [], []
+        items, common = list[int](), list[bool]()
         for rows, distance in apart:
             near = (distance <= alike) | np.eye(len(rows), dtype=bool)
-            first = True
+            start = len(items)
             while near.any():
                 likes = near.sum(axis=0)
                 best = int(likes.argmax())
-                items.append(rows[best])
-                common.append(first or likes[best] >= COMMON)
+                common.append(len(items) == start or likes[best] >= COMMON)
+                items.append(int(rows[best]))
                 near[near[:, best]] = False  # these are represented
-                first = False
         if len(items) <= max(most, len(apart)):
             return np.array(items, dtype=np.int64), np.array(common, dtype=bool)
         alike *= 1.5

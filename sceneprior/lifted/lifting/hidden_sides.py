@@ -24,8 +24,7 @@ CLOSE_M = 0.05
 FAR_M = 1.0
 """Distance from a wall or the floor beyond which no hidden side is moved to it."""
 LEAST_M = 0.02
-"""Extent that an object keeps when one of its sides is moved inwards, unless it has less: one that
-stands in a wall's line could otherwise lose all of its depth."""
+"""Extent that an object in the line of a wall keeps when its side is moved, unless it has less."""
 HIDDEN = 0.75
 """Share of the cells between a side and a plane that must be hidden behind the object."""
 CELLS = 8
@@ -66,9 +65,8 @@ def moved_to_planes(
         middle_m[axis] = sides_m[end, axis]
         gaps_m = own[:, :3] @ middle_m - own[:, 3]
         gap_m = gaps_m[gaps_m >= -close_m].min(initial=np.inf)
-        if gap_m > (close_m if ceiling else FAR_M):
-            continue
-        if ceiling and (at_wall or sides_m[0, 1] <= HANGS_M):
+        stands = at_wall or sides_m[0, 1] <= HANGS_M
+        if gap_m > (close_m if ceiling else FAR_M) or (ceiling and stands):
             continue
         if gap_m > close_m:
             space_m = sides_m.copy()
@@ -78,7 +76,6 @@ def moved_to_planes(
             if (hull.emptiness <= EMPTY).mean() < HIDDEN:
                 continue
         at_wall |= axis != 1
-        moved_m = outwards * sides_m[end, axis] + gap_m - (AT_WALL_M if axis != 1 else 0)
-        least_m = outwards * sides_m[1 - end, axis] + min(LEAST_M, np.ptp(sides_m[:, axis]))
-        sides_m[end, axis] = outwards * max(moved_m, least_m)
+        spare_m = max(float(np.ptp(sides_m[:, axis])) - LEAST_M, 0.0)
+        sides_m[end, axis] += outwards * max(gap_m - (AT_WALL_M if axis != 1 else 0), -spare_m)
     return sides_m

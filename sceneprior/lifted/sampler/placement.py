@@ -8,22 +8,11 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from sceneprior.core.boxes import QUARTERS, turn_boxes
 from sceneprior.core.mixtures import FIRST_SCALE, LogisticMixture
 from sceneprior.lifted.prototypes import PARTS, PosedRooms, turn_posed
-from sceneprior.lifted.sampler.anchors import (
-    BY_OBJECT,
-    BY_SIDES,
-    GAPS_M,
-    NEAR_M,
-    OF_GAP,
-    OF_OBJECT,
-    OF_SIDES,
-    Anchors,
-    Surroundings,
-    ramps,
-)
 from sceneprior.lifted.sampler.contents import MANY, reached
 from sceneprior.lifted.sampler.frames import (
     gaps_to_sides_m,
@@ -47,10 +36,53 @@ at one of the two anchors at each position given by the room, and at anchors `AP
 object."""
 SHIFT_M = 0.3
 """Shift of an anchor in metres for a network output of 1."""
+BY_SIDES = 8
+"""Number of anchors along an axis given by the room: a narrow and a wide one at each of four
+positions. These are flush with the lower side of the rectangle, flush with its upper side, in its
+middle, and at the origin, which is the middle of the floor."""
+BY_OBJECT = 10
+"""Number of anchors along an axis per object already placed: adjacent before it, flush with its
+lower side, centred, flush with its upper side, adjacent behind it, `APART_M` before and behind it,
+midway between it and the lower and the upper side of the rectangle, and at its mirror image
+(`mirror_images`)."""
+APART_M = 0.4
+"""Gap between an object and the two anchors apart from it."""
 DRAWS, DENSER = 8, 4
-"""Sampling from the denser part of a distribution draws `DRAWS` values along each axis and takes
-the first of the `DENSER` ones of highest density. Otherwise many unlikely anchors together would
-have enough weight that one of four chairs stands away from the table."""
+"""Of `DRAWS` values along each axis, the first of the `DENSER` densest is taken. Otherwise many
+unlikely anchors together would have enough weight that one of four chairs stands apart."""
+GAPS_M = (-0.4, -0.15, -0.05, 0.0, 0.05, 0.15, 0.4, 0.7, 1.0, 1.5, 2.0)
+"""Knots of `ramps` for gaps; negative gaps are overlaps."""
+OFFSETS_M = (-1.5, -0.7, -0.3, -0.1, -0.03, 0.03, 0.1, 0.3, 0.7, 1.5)
+"""Knots of `ramps` for offsets of centres and sides."""
+NEAR_M = (0.05, 0.15, 0.5)
+"""Distances from a mirror image at which its features become 0."""
+OF_GAP, OF_OFFSET = len(GAPS_M) - 1, len(OFFSETS_M) - 1
+OF_OBJECT, OF_SIDES = OF_GAP + 3 * OF_OFFSET + len(NEAR_M), 4 * OF_GAP
+"""Number of features, along an axis, of the relation to an object; and of the two sides of the
+rectangle: the gap to the object, and what stays free beside all furniture."""
+
+
+def ramps(lengths_m: Float[Tensor, "*batch n"], knots_m: tuple[float, ...]) -> Tensor:
+    """Piecewise linear features of lengths: each rises from 0 to 1 between two knots.
+
+    Example:
+
+        >>> ramps(torch.tensor([0.5]), (0.0, 1.0, 2.0))
+        tensor([0.5000, 0.0000])
+    """
+    knots = torch.tensor(knots_m).to(lengths_m)
+    rising = lengths_m.unsqueeze(-1) - knots[:-1]
+    return rising.div_(knots.diff()).clamp_(0, 1).flatten(-2)
+
+
+class Anchors(NamedTuple):
+    """Candidate positions of an object along an axis."""
+
+    at_m: Float[Tensor, "rooms anchors"]
+    exists: Bool[Tensor, "rooms anchors"]
+    """False for the anchors of padding."""
+    kind: Int[Tensor, " anchors"]
+    """0 to 7 for anchors given by the room, 8 to 17 for anchors of an object."""
 
 
 class Places(NamedTuple):
@@ -58,21 +90,27 @@ class Places(NamedTuple):
     of that object (`frames.py`)."""
 
     placement: "Placement"
-    around: Surroundings
     label: Int[Tensor, " rooms"]
     object_class: Int[Tensor, "rooms objects"]
     own: Float[Tensor, "rooms width"]
     there: Float[Tensor, "rooms objects width"]
+    size_m: Float[Tensor, "rooms 2"]
+    rectangle_m: Float[Tensor, "rooms 4"]
+    footprints_m: Float[Tensor, "rooms objects 4"]
+    """Centre x, z and extents x, z of the objects already placed."""
+    is_object: Bool[Tensor, "rooms objects"]
     meets: Bool[Tensor, "rooms objects"]
     """True for placed objects whose vertical extent overlaps with that of the object to be
     placed."""
+    images_m: Float[Tensor, "rooms objects 2"]
+    """Mirror image (x, z) of each placed object of the same class; see `mirror_images`."""
+    has_image: Bool[Tensor, "rooms objects"]
     quarters: Int[Tensor, " rooms"]
     """Quarter turns that take the room to the frame."""
 
     def rows(self, rows: Int[Tensor, " some"]) -> "Places":
         """The distribution in these rooms."""
-        parts = (part[rows] for part in self[2:])
-        return Places(self.placement, self.around.rows(rows), *parts)
+        return Places(self.placement, *(part[rows] for part in self[1:]))
 
     def log_prob(self, place_m: Float[Tensor, "rooms 2"]) -> Float[Tensor, " rooms"]:
         """Log-densities of places in the rooms."""
@@ -100,18 +138,18 @@ class Places(NamedTuple):
         return turn_places(torch.stack([x, z], dim=-1), -self.quarters % QUARTERS)
 
     def _along_x(self) -> LogisticMixture:
-        anchors = self.around.anchors(0)
-        relations, sides, _ = self.around.relations(0, anchors.at_m)
+        anchors = self._anchors(0)
+        relations, sides, _ = self._relations(0, anchors.at_m)
         return self.placement.along_x(self, anchors, (relations,), sides)
 
     def _along_z(self, x: Float[Tensor, " rooms"]) -> LogisticMixture:
-        anchors = self.around.anchors(1)
-        relations_x, sides_x, gap_x = self.around.relations(0, x.unsqueeze(1))
-        relations_z, sides_z, gap_z = self.around.relations(1, anchors.at_m)
+        anchors = self._anchors(1)
+        relations_x, sides_x, gap_x = self._relations(0, x.unsqueeze(1))
+        relations_z, sides_z, gap_z = self._relations(1, anchors.at_m)
         apart = ramps(torch.maximum(gap_x, gap_z).unsqueeze(-1), GAPS_M)
-        sizes_m = self.around.size_m, self.around.footprints_m[..., 2:]
-        own_m2, theirs_m2 = (size_m.prod(dim=-1) for size_m in sizes_m)
-        least = torch.minimum(own_m2.unsqueeze(1), theirs_m2)
+        least = torch.minimum(
+            self.size_m.prod(dim=-1, keepdim=True), self.footprints_m[..., 2:].prod(dim=-1)
+        )
         shared = gap_x.clamp(max=0) * gap_z.clamp(max=0) / least.clamp(min=1e-6).unsqueeze(1)
         shared = (shared * self.meets.unsqueeze(1)).clamp(max=1).unsqueeze(-1)
         # An object is near an image only if it is so along both axes.
@@ -120,6 +158,64 @@ class Places(NamedTuple):
         return self.placement.along_z(
             self, anchors, (relations_x, relations_z, apart, shared.sqrt()), sides
         )
+
+    def _anchors(self, axis: int) -> Anchors:
+        """The anchors along x (0) or z (1)."""
+        middle, extent = self.rectangle_m[:, axis], self.rectangle_m[:, 2 + axis]
+        size = self.size_m[:, axis]
+        free = ((extent - size) / 2).clamp(min=0)
+        sides = torch.stack([middle - free, middle + free, middle, torch.zeros_like(free)], dim=1)
+        sides = sides.repeat_interleave(2, dim=1)
+        centre, theirs = self.footprints_m[..., axis], self.footprints_m[..., 2 + axis]
+        total, difference = (theirs + size.unsqueeze(1)) / 2, (theirs - size.unsqueeze(1)) / 2
+        away = torch.stack(
+            [-total, -difference, torch.zeros_like(total), difference, total,
+             -total - APART_M, total + APART_M], dim=-1,
+        )  # fmt: skip
+        low_m, high_m = (middle - extent / 2).unsqueeze(1), (middle + extent / 2).unsqueeze(1)
+        before_m, behind_m = centre - theirs / 2, centre + theirs / 2
+        midway = [(low_m + before_m) / 2, (behind_m + high_m) / 2]
+        has_room = torch.stack([before_m - low_m, high_m - behind_m], dim=-1) >= size[:, None, None]
+        beside = torch.cat([
+            centre.unsqueeze(-1) + away, torch.stack([*midway, self.images_m[..., axis]], dim=-1)
+        ], dim=-1)  # fmt: skip
+        exists = self.is_object.unsqueeze(-1).repeat(1, 1, BY_OBJECT)
+        exists[..., -3:] &= torch.cat([has_room, self.has_image.unsqueeze(-1)], dim=-1)
+        kinds = torch.arange(BY_SIDES + BY_OBJECT, device=size.device)
+        return Anchors(
+            torch.cat([sides, beside.flatten(1)], dim=1),
+            torch.cat([torch.ones_like(sides, dtype=torch.bool), exists.flatten(1)], dim=1),
+            torch.cat([kinds[:BY_SIDES], kinds[BY_SIDES:].repeat(centre.shape[1])]),
+        )
+
+    def _relations(self, axis: int, at_m: Float[Tensor, "rooms anchors"]) -> tuple[Tensor, ...]:
+        """Features, along an axis, of the relations to the objects already placed and to the sides
+        of the rectangle, and the gap to each object in metres, negative where they overlap."""
+        size = self.size_m[:, axis].unsqueeze(1)
+        offset = self.footprints_m[:, None, :, axis] - at_m.unsqueeze(-1)
+        theirs = self.footprints_m[..., 2 + axis]
+        total, difference = ((theirs + size) / 2).unsqueeze(1), ((theirs - size) / 2).unsqueeze(1)
+        gap = offset.abs() - total
+        offsets = torch.stack([offset, offset - difference, offset + difference], dim=-1)
+        from_image = (self.images_m[:, None, :, axis] - at_m.unsqueeze(-1)).abs().unsqueeze(-1)
+        near = (1 - from_image / from_image.new_tensor(NEAR_M)).clamp(min=0)
+        relations = [
+            ramps(gap.unsqueeze(-1), GAPS_M), ramps(offsets, OFFSETS_M),
+            near * self.has_image[:, None, :, None],
+        ]  # fmt: skip
+        middle, extent = (self.rectangle_m[:, [at]] for at in (axis, 2 + axis))
+
+        def to_sides(at_m: Tensor, size: Tensor) -> Tensor:
+            to_middle = at_m - middle
+            low_high = torch.stack([extent / 2 + to_middle, extent / 2 - to_middle], dim=-1)
+            return low_high - size.unsqueeze(-1) / 2
+
+        own, others = to_sides(at_m, size), to_sides(self.footprints_m[..., axis], theirs)
+        # What stays free between a side and all furniture once this object stands.
+        others = others.masked_fill(~self.is_object.unsqueeze(-1), torch.inf)
+        nearest = F.pad(others, (0, 0, 0, 1), value=torch.inf).amin(dim=1, keepdim=True)
+        sides = torch.cat([own, torch.minimum(own, nearest)], dim=-1)
+        return torch.cat(relations, dim=-1), ramps(sides, GAPS_M), gap
 
 
 class AxisScore(nn.Module):
@@ -172,7 +268,7 @@ class AxisScore(nn.Module):
         given = self.own(places.own).unsqueeze(1) + self.there(places.there)
         # Padding adds relu(-inf) = 0. The tensors of all anchors and objects are so large that each
         # pass over them takes time, so they are changed in place.
-        given = given.masked_fill(~places.around.is_object.unsqueeze(-1), -torch.inf).unsqueeze(1)
+        given = given.masked_fill(~places.is_object.unsqueeze(-1), -torch.inf).unsqueeze(1)
         widths = [part.shape[-1] for part in relations]
         for part, weight in zip(relations, self.relation.weight.split(widths, 1), strict=True):
             given = (part @ weight.T).add_(given)
@@ -183,7 +279,7 @@ class AxisScore(nn.Module):
         )
         logit, shift, scale = self.out(self.dropout(torch.relu(hidden))).unbind(dim=-1)
         table = self.pair_table[places.label.unsqueeze(1), places.object_class]
-        table = table * places.around.is_object.unsqueeze(-1)
+        table = table * places.is_object.unsqueeze(-1)
         for part, weight in zip(relations, table.split(widths, dim=-1), strict=True):
             logit = logit + torch.einsum("raof,rof->ra", part, weight)
         logit = logit + torch.einsum("raf,rf->ra", sides, self.side_table[places.label])
@@ -275,12 +371,9 @@ class Placement(nn.Module):
         level = centre * torch.tensor([0.0, 1.0, 0.0]).to(centre)
         meets = shared_extents(own_box, torch.cat([level, extents], dim=-1))[..., 1] > 0
         images_m, has_image = mirror_images(before, label, backs_there)
-        footprints_m = before.boxes_m[..., [0, 2, 3, 5]]
-        around = Surroundings(
-            size_m[:, ::2], rectangle_m, footprints_m, before.is_object, images_m, has_image
-        )
         return Places(
-            self, around, label, before.object_class,
+            self, label, before.object_class,
             self.dropout(torch.relu(self.own(own))), self.dropout(torch.relu(self.there(there))),
-            meets, quarters,
+            size_m[:, ::2], rectangle_m, before.boxes_m[..., [0, 2, 3, 5]], before.is_object,
+            meets, images_m, has_image, quarters,
         )  # fmt: skip

@@ -123,13 +123,10 @@ def test_scores_are_those_of_plain_layers_on_joined_features(placement, given, a
         calls.append((*given, found))
 
     places = distribution(placement, *given)
-    assert places.around.has_image.any(), "so that images are among the features"
+    assert places.has_image.any(), "so that images are among the features"
     with score.register_forward_hook(watched):
         places.log_prob(torch.rand(3, 2).double())
-    (places, anchors, relations, sides, found), real = (
-        calls[0],
-        places.around.is_object[:, None, :, None],
-    )
+    (places, anchors, relations, sides, found), real = calls[0], places.is_object[:, None, :, None]
     number = anchors.at_m.shape[1]
     joined = torch.cat([part.expand(-1, number, -1, -1) for part in relations], dim=-1)
     met = score.own(places.own).unsqueeze(1) + score.there(places.there)
