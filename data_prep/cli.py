@@ -3,7 +3,7 @@
 Heavy imports are inside the functions, so that the command line starts quickly.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,6 +13,8 @@ import typer
 from sceneprior.core.repeatable import LARGEST_SEED
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from data_prep.engine.source import Source
 
 
@@ -278,8 +280,6 @@ def inspect(
 
     Exit status: 0, or 3 if --verify finds something wrong.
     """
-    from rich.console import Console
-
     from data_prep.inspection.pictures import draw_sheet
     from data_prep.inspection.tables import count_tables, room_table
     from sceneprior.core.files import write_whole
@@ -288,24 +288,26 @@ def inspect(
     if verify:
         _verify(shards, room)
     else:
-        for table in count_tables(shards) if room is None else [room_table(shards, room)]:
-            Console().print(table)
+        _print(count_tables(shards) if room is None else [room_table(shards, room)])
     if png is not None or not verify:
         target = png or shards / _SHEET
-        sheet = draw_sheet(shards, room, pictures)
-        write_whole(target, png_bytes(sheet))
+        write_whole(target, png_bytes(draw_sheet(shards, room, pictures)))
         typer.echo(f"Drew {target}.")
 
 
-def _verify(shards: Path, room: str | None) -> None:
+def _print(tables: "Iterable[Table]") -> None:
     from rich.console import Console
 
+    for table in tables:
+        Console().print(table)
+
+
+def _verify(shards: Path, room: str | None) -> None:
     from data_prep.inspection.tables import check_tables, summary
     from data_prep.inspection.verify import verify
 
     found = verify(shards, room)
-    for table in check_tables(found):
-        Console().print(table)
+    _print(check_tables(found))
     for sentence in found.problems[1:_PROBLEMS_SHOWN]:
         typer.echo(sentence, err=True)
     if found.problems:
@@ -319,8 +321,6 @@ def _verify(shards: Path, room: str | None) -> None:
 def run_job(source: "Source", out: Path, verified: bool = False, **options: Any) -> None:
     """Build shards and print the report, for every `prep-*` command; `options` are those of
     `Job`. If `verified`, the verdict of `inspect --verify` follows."""
-    from rich.console import Console
-
     from data_prep.engine.build import Job, build_shards
     from data_prep.engine.report import report_tables
 
@@ -329,8 +329,7 @@ def run_job(source: "Source", out: Path, verified: bool = False, **options: Any)
     except KeyboardInterrupt:
         typer.echo("Stopped; finished shards are kept. Run the same command to continue.", err=True)
         raise typer.Exit(130) from None
-    for table in report_tables(summary.report):
-        Console().print(table)
+    _print(report_tables(summary.report))
     made = f"{summary.shards_made} shards made, {summary.shards_kept} already there"
     if summary.shards_open:
         made += f", {summary.shards_open} still to make: run without --only"

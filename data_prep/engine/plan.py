@@ -155,13 +155,13 @@ def seeded_split(
 
 
 def of_one_size(
-    sizes: Mapping[str, tuple[int, int]], houses: Mapping[str, str] | None = None
+    sizes: Mapping[str, tuple[int, int]], houses: Mapping[str, str]
 ) -> tuple[list[str], list[Line]]:
     """Keep the rooms whose images have the most frequent (height, width).
 
     Batches hold images of several rooms, so all rooms of a folder must have one size. Returns the
     ids of the rooms that are kept, and lines of the report for the others; `houses` has the house
-    of each room, which by default is the room itself.
+    of each room.
     """
     usual = Counter(sizes.values()).most_common(1)[0][0] if sizes else (0, 0)
     kept, left_out = [], []
@@ -173,8 +173,7 @@ def of_one_size(
             f"its views are {size[1]} x {size[0]} pixels, those of most rooms {usual[1]} x "
             f"{usual[0]}, and all shards of a folder need one size; prepare it separately"
         )
-        house = room_id if houses is None else houses[room_id]
-        left_out.append(Line(room_id, house, "filtered", "image_size", why))
+        left_out.append(Line(room_id, houses[room_id], "filtered", "image_size", why))
     return kept, left_out
 
 
@@ -204,10 +203,9 @@ def in_words(left_out: Iterable[Line]) -> str:
     """Number of rooms left out, and the most frequent reason."""
     reasons = [item.reason for item in left_out]
     # Reasons that differ only in numbers count as one; the first is quoted.
-    shapes = Counter(re.sub(r"[\d.]+", "#", reason) for reason in reasons)
+    shapes = [re.sub(r"[\d.]+", "#", reason) for reason in reasons]
     often = ""
     if shapes:
-        shape = shapes.most_common(1)[0][0]
-        often = next(reason for reason in reasons if re.sub(r"[\d.]+", "#", reason) == shape)
-        often = f"; the most frequent reason: {often.rstrip('.')}"
+        shape = Counter(shapes).most_common(1)[0][0]
+        often = f"; the most frequent reason: {reasons[shapes.index(shape)].rstrip('.')}"
     return f"{len(reasons)} were left out{often}"

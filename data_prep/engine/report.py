@@ -252,8 +252,7 @@ def report_tables(report: dict[str, Any]) -> list[Table]:
     if expected := report.get("expected"):
         cells = [[*row.values()] for row in expected["rows"]]
         rows = [(*others, f"{more:+d}" if more else "as expected") for *others, more in cells]
-        titles = ("what", "expected", "found", "difference")
-        tables.append(make_table(titles, rows, expected["of"]))
+        tables.append(make_table(("what", "expected", "found", "difference"), rows, expected["of"]))
 
     def add_some(name: str, other: str, rows: list[tuple[str, Any]], more: tuple[str, str]) -> None:
         if rows:

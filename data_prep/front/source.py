@@ -94,10 +94,9 @@ class FrontSource:
                     entries = [room for room in parse_house(path).rooms if isinstance(room, dict)]
                     types.update(str(entry.get("type") or "?") for entry in entries)
             said = ", ".join(f"{name} ({count})" for name, count in types.most_common())
-            there = said or "none that could be read"
             raise InputError(
                 f"No room of {self.front} is of a type that {self.recipe.name} selects ({kinds}); "
-                f"the folder has {there}."
+                f"the folder has {said or 'none that could be read'}."
             )
         if self.splits is None:
             room_ids = [room_id for room_id, _, _ in found]

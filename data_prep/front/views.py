@@ -251,7 +251,9 @@ def _draw_views(
 
 def _draw_stuff(room: Room, views: RoomViews, renderer: Renderer) -> np.ndarray:
     """Draw floor, walls, doors, windows and ceiling behind all furniture; see `RoomViews.stuff`."""
-    meshes = [soup(room.shell.get(name, np.zeros((0, 3, 3)))) for name in STUFF[1:]]
+    corners = [room.shell.get(name, np.zeros((0, 3, 3))).reshape(-1, 3) for name in STUFF[1:]]
+    # Triangles share no corners.
+    meshes = [Mesh(each, np.arange(len(each), dtype=np.int32).reshape(-1, 3)) for each in corners]
     step = stuff_step(views.image_size)
     cameras = [
         Pinhole(turn.astype(np.float64), thinned_intrinsics(K, step))
@@ -261,9 +263,3 @@ def _draw_stuff(room: Room, views: RoomViews, renderer: Renderer) -> np.ndarray:
     assert views.instance_ids is not None
     free = views.instance_ids[(..., *thinned(step))] == 0
     return np.where(free, stuff, 0).astype(np.uint8)
-
-
-def soup(triangles: np.ndarray) -> Mesh:
-    """Mesh of triangles, (F, 3, 3), that share no corners."""
-    corners = triangles.reshape(-1, 3)
-    return Mesh(corners, np.arange(len(corners), dtype=np.int32).reshape(-1, 3))

@@ -264,10 +264,8 @@ def compare(room: Room) -> Comparison:
     # Comparisons with NaN (behind the camera) are false: undefined projections disagree.
     begins = (boxes[..., :2] <= masks[..., :2] + margin).all(axis=-1)
     held = np.logical_and(begins, (boxes[..., 2:] >= masks[..., 2:] - margin).all(axis=-1))
-    low, high = (
-        np.maximum(boxes[..., :2], masks[..., :2]),
-        np.minimum(boxes[..., 2:], masks[..., 2:]),
-    )
+    low = np.maximum(boxes[..., :2], masks[..., :2])
+    high = np.minimum(boxes[..., 2:], masks[..., 2:])
     shared = np.maximum(high - low, 0).prod(axis=-1)
     union = sum((box[..., 2:] - box[..., :2]).prod(axis=-1) for box in (boxes, masks)) - shared
     iou = np.divide(shared, union, out=np.zeros_like(shared), where=union > 0)

@@ -275,10 +275,8 @@ def _scaled(room: Room, _: Convention) -> Corrected:
     targets = np.array([(points.min(axis=0) + points.max(axis=0)) / 2 for points in hulls])
     pixels = (views.boxes[:, there, :2] + views.boxes[:, there, 2:]) / 2 * room.size_px
     rays = pixel_rays(pixels, views.world_to_camera, views.intrinsics)[shown]
-    eyes, targets = (
-        np.broadcast_to(points, (*shown.shape, 3))[shown]
-        for points in (camera_centers(views.world_to_camera)[:, None], targets)
-    )
+    view, item = np.nonzero(shown)
+    eyes, targets = camera_centers(views.world_to_camera)[view], targets[item]
     across, length = np.cross(rays, eyes), (np.cross(rays, eyes) ** 2).sum(axis=1)
     ratios = (across * np.cross(rays, targets)).sum(axis=1)[length > 0] / length[length > 0]
     factor = float(np.median(ratios)) if len(ratios) else 0.0

@@ -113,12 +113,10 @@ def _tracked_better(rooms: Iterable[RoomViews]) -> str:
     than the given ids, say how well both fit; else ""."""
     sums = np.zeros((2, 2))
     for views in rooms:
+        poses = views.world_to_camera[None].astype(np.float64)
+        lenses = views.intrinsics[None].astype(np.float64)
         for row, of_ids in enumerate((views, _retracked(views))):
             seen = middles(of_ids)
-            poses, lenses = (
-                array[None].astype(np.float64)
-                for array in (views.world_to_camera, views.intrinsics)
-            )
             sums[row] += float(fit(seen, poses, lenses).sum()), len(seen.item)
     (given, of_given), (found, of_found) = sums.tolist()
     # With right poses and wrong ids, most masks join others; with wrong poses, hardly any do.

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import shapely
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 
 from data_prep.inspection.agreement import Hull, project_edges
 from sceneprior.core.boxes import BOX_EDGES, box_corners
@@ -52,7 +52,7 @@ def draw_sheet(folder: Path, room_id: str | None, pictures: int) -> Image.Image:
     picture = Image.fromarray(np.pad(sheet, borders, constant_values=255))
     draw = ImageDraw.Draw(picture)
     for i, line in enumerate(lines):
-        draw.text((_GAP_PX, 4 + _LINE_PX * i), line, fill="black", font=_font(11))
+        draw.text((_GAP_PX, 4 + _LINE_PX * i), line, fill="black", font_size=11)
     return picture
 
 
@@ -141,7 +141,7 @@ def draw_view(
     for name, end in zip(AXES, np.eye(3) * _AXIS_M, strict=True):
         for line in project(np.stack([np.zeros(3), end]), [(0, 1)]):
             draw.line(line, fill=AXES[name], width=2)
-            draw.text((line[2], line[3]), name, fill=AXES[name], font=_font(12), anchor="mm")
+            draw.text((line[2], line[3]), name, fill=AXES[name], font_size=12, anchor="mm")
     seen = np.flatnonzero(room.visible[view]).tolist()
     for k in [] if truth is None else seen:
         assert truth is not None
@@ -206,7 +206,7 @@ def draw_plan(shard: Shard, room_id: str) -> Image.Image:
         draw.line((u, v, *at(ahead[0], ahead[2])), fill=OUTLINE)
     for name, (x, z) in {"x": (_AXIS_M, 0.0), "z": (0.0, _AXIS_M)}.items():
         draw.line((*at(0, 0), *at(x, z)), fill=AXES[name], width=2)
-        draw.text(at(1.2 * x, 1.2 * z), name, fill=AXES[name], font=_font(12), anchor="mm")
+        draw.text(at(1.2 * x, 1.2 * z), name, fill=AXES[name], font_size=12, anchor="mm")
     return picture
 
 
@@ -255,15 +255,11 @@ def _front(truth: RoomGroundTruth, k: int) -> np.ndarray:
 
 
 def _tag(draw: ImageDraw.ImageDraw, place: tuple[float, float], text: str, color: Color) -> None:
-    left, top, right, bottom = draw.textbbox(place, text, font=_font(11))
+    left, top, right, bottom = draw.textbbox(place, text, font_size=11)
     draw.rectangle((left - 1, top - 1, right + 1, bottom + 1), fill=color)
-    draw.text(place, text, fill="white", font=_font(11))
+    draw.text(place, text, fill="white", font_size=11)
 
 
 def _dark(color: np.ndarray) -> Color:
     red, green, blue = (int(channel) * 11 // 20 for channel in color)
     return (red, green, blue)
-
-
-def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    return ImageFont.load_default(size=size)

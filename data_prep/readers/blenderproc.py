@@ -61,10 +61,6 @@ class _Part(BaseModel):
         return {key.removeprefix("cp_"): value for key, value in row.items() if value is not None}
 
 
-class _Parts(RootModel[list[_Part]]):
-    """All parts of a frame."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class BlenderProc(Reader):
     """BlenderProc's frames; a house is a scene with several rooms."""
@@ -152,9 +148,8 @@ class BlenderProc(Reader):
             images.append(table[image[:, ::-1]][lines])
             intrinsics.append(K)
         mirrored = _FROM_BLENDER @ poses[frames] @ _MIRROR @ GL_TO_CV
-        ids = np.stack(images)
         return FramedRoom(
-            **numbered(ids, classes, self.label_set, task.room_id, notes=notes),
+            **numbered(np.stack(images), classes, self.label_set, task.room_id, notes=notes),
             camera_to_world=mirrored,
             intrinsics=np.stack(intrinsics),
             floor_y=0.0,
@@ -173,7 +168,8 @@ def _read_frame(path: Path) -> tuple[np.ndarray, list[_Part]]:
         raise InputError(
             f"{path}: instance_attribute_maps is not JSON ({reason}); {_HINT}."
         ) from None
-    parts = checked(_Parts, rows, f"{path}, instance_attribute_maps", hint=_HINT).root
+    where = f"{path}, instance_attribute_maps"
+    parts = checked(RootModel[list[_Part]], rows, where, hint=_HINT).root
     return image, [part for part in parts if part.inst_mark and "layout" not in part.inst_mark]
 
 

@@ -124,9 +124,8 @@ def correct(
     notes: list[str] = []
     poses = world_to_camera.astype(np.float64)
     change = _adjusted(outlines, poses)
-    gaps, corrected = (
-        measure_gaps(outlines, poses, each) for each in (np.zeros_like(change), change)
-    )
+    gaps = measure_gaps(outlines, poses, np.zeros_like(change))
+    corrected = measure_gaps(outlines, poses, change)
     before, after = gaps.median_px, corrected.median_px
     moved = None
     if before > WRONG_PX and after <= _FIT_PX and _poses_err(outlines, poses):

@@ -143,8 +143,7 @@ class Reader(ABC):
         return str(self.splits or "the split, or give one with --splits")
 
     def settings(self, only: str | None) -> dict[str, Any]:
-        options = self.options()
-        return {"recipe": options, "seed": self.seed, **self.fingerprint(self._chosen(only))}
+        return {"recipe": self.options(), "seed": self.seed, **self.fingerprint(self._chosen(only))}
 
     def survey(self) -> Survey:
         """List the rooms of every scene."""

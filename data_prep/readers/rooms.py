@@ -192,8 +192,7 @@ def prepare_room(task: RoomTask, room: FramedRoom) -> PreparedRoom | Line:
     if not missing:
         truth, models = _truth(room, objects, float(ceiling_y - origin[1]))
         if room.scan is not None:
-            size = views.image_size
-            whole = unoccluded(room.scan, seen.tracked, cameras, room.intrinsics, size)
+            whole = unoccluded(room.scan, seen.tracked, cameras, room.intrinsics, views.image_size)
             truth = replace(truth, unoccluded=whole)
     elif room.boxes:
         notes.append(f"{missing} of {len(seen.tracked)} objects have no 3D box: no ground truth")

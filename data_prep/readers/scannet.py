@@ -90,13 +90,8 @@ class ScanNet(Reader):
         if self.train or self.val:
             split_scans(self.scenes(), self.train, self.val)
         texts = {"labels": self.labels, "train": self.train, "val": self.val}
-        return {
-            "scans": digest("\n".join(scenes)),
-            **{
-                name: None if path is None else digest(read_text(path))
-                for name, path in texts.items()
-            },
-        }
+        digests = {name: path and digest(read_text(path)) for name, path in texts.items()}
+        return {"scans": digest("\n".join(scenes)), **digests}
 
     def scenes(self) -> list[str]:
         """See `Reader.scenes`; a scan without its `.sens` is listed, so that the report has it."""
@@ -281,14 +276,9 @@ def find_scans(folder: Path) -> list[Path]:
         raise InputError(f"No folder at {folder}; --scans names ScanNet's folder of scans.")
     found = list(filter(_is_scan, list_folders(folder)))
     if not found:
-        inside = folder / "scans"
-        hint = (
-            f"; did you mean {inside}?"
-            if inside.is_dir()
-            else f"; did you mean {folder.absolute().parent}?"
-            if _is_scan(folder.absolute())
-            else "."
-        )
+        inside, whole = folder / "scans", folder.absolute()
+        meant = inside if inside.is_dir() else whole.parent if _is_scan(whole) else None
+        hint = "." if meant is None else f"; did you mean {meant}?"
         raise InputError(f"{folder} holds no scans (scene0000_00/ and so on){hint}")
     return found
 

@@ -52,10 +52,6 @@ class _Frame(BaseModel):
     intrinsic: Annotated[list[list[float]], Field(min_length=3, max_length=3)]
 
 
-class _Frames(RootModel[dict[str, _Frame]]):
-    pass
-
-
 @dataclass(frozen=True, kw_only=True)
 class ScanNetPP(Reader):
     """ScanNet++; a scene is a room."""
@@ -111,14 +107,8 @@ class ScanNetPP(Reader):
         stuff = np.append(_most_common(vertex_stuff[mesh.faces]), np.uint8(0))[faces]
         points = {k: mesh.vertices_m[item.part] for k, item in enumerate(scan.objects, start=1)}
         points = {k: own for k, own in points.items() if len(own)}
-        heights = np.concatenate(
-            [
-                mesh.vertices_m[item.part, 1]
-                for item in scan.objects
-                if labels.nyu40_class(item.category) == "floor"
-            ]
-            or [np.zeros(0)]
-        )
+        floors = [it.part for it in scan.objects if labels.nyu40_class(it.category) == "floor"]
+        heights = mesh.vertices_m[np.concatenate([np.zeros(0, np.int64), *floors]), 1]
         return FramedRoom(
             **numbered(
                 ids, classes, self.label_set, task.room_id, points, stuff, (*scan.notes, *notes)
@@ -147,7 +137,8 @@ def _cameras(scene: Path) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
             f"{scene} has no poses; expected dslr/colmap, dslr/nerfstudio, iphone/colmap, "
             f"iphone/nerfstudio or {_IPHONE}. Download one of them."
         )
-    rows = [frame for _, frame in sorted(checked(_Frames, read_json(path), str(path)).root.items())]
+    frames_by_name = checked(RootModel[dict[str, _Frame]], read_json(path), str(path)).root
+    rows = [frame for _, frame in sorted(frames_by_name.items())]
     try:
         aligned = np.array([row.aligned_pose for row in rows]).reshape(-1, 4, 4)
         matrices = np.array([row.intrinsic for row in rows]).reshape(-1, 3, 3)

@@ -45,10 +45,6 @@ class _Box(BaseModel):
     centroid: tuple[float, float, float]
 
 
-class _Boxes(RootModel[list[_Box]]):
-    pass
-
-
 class _Junction(BaseModel):
     coordinate: tuple[float, float, float]
 
@@ -175,7 +171,7 @@ def _read_boxes(path: Path) -> dict[int, np.ndarray]:
     """Boxes by instance + 1, in metres with y up."""
     turn = Y_UP[:3, :3]
     found = {}
-    for box in checked(_Boxes, read_json(path), str(path)).root:
+    for box in checked(RootModel[list[_Box]], read_json(path), str(path)).root:
         axes = np.array(box.basis)
         half = np.abs(np.array(box.coeffs)) * _METRES
         if axes.shape == (3, 3) and np.isfinite(axes).all() and (half > 0).all():

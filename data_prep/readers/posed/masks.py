@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from data_prep.readers.frames import mask_intrinsics, sampled_lines, turned_hint
+from data_prep.readers.frames import mask_intrinsics, sampled, turned_hint
 from data_prep.readers.posed.cameras import Lens, Straightened, straighten
 from data_prep.readers.posed.recording import INSTANCES, PosedFrame, as_png, frame_intrinsics
 from data_prep.tracks.associate import UNKNOWN, FrameMasks, associate
@@ -185,9 +185,7 @@ def main_classes(
     notes = [f"ids with several classes take the most frequent one: {_some(changing)}"]
     own = {tidy(name) for name in label_set(label_set_name)}
     most = {
-        number: max((n, tidy(name) in own, -k, name) for k, (name, n) in enumerate(count.items()))[
-            -1
-        ]
+        number: max(count, key=lambda name: (count[name], tidy(name) in own))
         for number, count in sorted(votes.items())
     }
     return most, notes if changing else []
@@ -211,7 +209,7 @@ def _some(words: list[str]) -> str:
 
 
 def read_tracked(
-    masks: MaskFormat, frames: list[PosedFrame], size: tuple[int, int], stored: tuple[int, int]
+    masks: MaskFormat, frames: list[PosedFrame], size: tuple[int, int], max_side: int | None
 ) -> dict[str, Any]:
     """Read masks whose ids are the same in all frames, as fields of a `FramedRoom`; see `_pixels`.
 
@@ -221,7 +219,7 @@ def read_tracked(
     of_lenses: list[str] = []
     images, stuff, intrinsics = [], [], []
     frames_of = np.zeros(len(table.classes) + 1, dtype=np.int64)
-    for values, K in _pixels(masks, frames, size, stored, of_lenses):
+    for values, K in _pixels(masks, frames, size, max_side, of_lenses):
         images.append(table.ids(values))
         frames_of[np.unique(images[-1])] += 1
         stuff.append(thinned_stuff(table.stuff(values)))
@@ -253,12 +251,12 @@ def read_untracked(
     masks: MaskFormat,
     frames: list[PosedFrame],
     size: tuple[int, int],
-    stored: tuple[int, int],
+    max_side: int | None,
     world_to_camera: np.ndarray,
 ) -> dict[str, Any]:
     """Read masks whose ids and classes belong to single frames, and find the objects they show."""
     of_lenses: list[str] = []
-    pixels = zip(*_pixels(masks, frames, size, stored, of_lenses), strict=True)
+    pixels = zip(*_pixels(masks, frames, size, max_side, of_lenses), strict=True)
     images, intrinsics = (np.stack(arrays) for arrays in pixels)
     # Masks of all frames are numbered through.
     numbers = np.where(images < 0, -1, 0)
@@ -309,14 +307,13 @@ def _pixels(
     masks: MaskFormat,
     frames: list[PosedFrame],
     size: tuple[int, int],
-    stored: tuple[int, int],
+    max_side: int | None,
     notes: list[str],
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Values of each frame's masks, int32 with -1 where unknown, and their intrinsics, undistorted
-    and downsampled. `size` is the (height, width) of all masks, and `stored` that of the
-    downsampled images; `notes` takes sentences on the lenses."""
+    and downsampled to `max_side`. `size` is the (height, width) of all masks; `notes` takes
+    sentences on the lenses."""
     views: dict[tuple[Lens, bytes], Straightened] = {}
-    lines = np.ix_(*(sampled_lines(*sides) for sides in zip(size, stored, strict=True)))
     for frame in frames:
         mask = masks.of(frame)
         if mask is None:
@@ -346,7 +343,8 @@ def _pixels(
                 raise InputError(f"frame {shown(frame.name)}: {error}") from None
             views[key] = view
             K, values = view.intrinsics, values[view.rows, view.columns]
-        yield values[lines], mask_intrinsics(K, size, size, stored)
+        lines, K = sampled(size, max_side, K)
+        yield values[lines], K
     for lens in dict.fromkeys(lens for lens, _ in views):
         cut = max(view.cut_share for (other, _), view in views.items() if other == lens)
         notes.append(f"the lens {lens} is undistorted; {cut:.0%} of its pictures is cut away")

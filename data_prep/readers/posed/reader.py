@@ -108,14 +108,13 @@ class Posed(Reader):
     def fingerprint(self, scenes: list[str]) -> dict[str, Any]:
         """See `Reader.fingerprint`: names and sizes of files are part of it, so that shards of
         older masks or classes are not reused."""
-        folders = self._folders()
         files = {
             name: digest_of_files(
                 pose_files(room, self.poses)[1]
                 + [room / table for table in TABLES if (room / table).is_file()]
                 + mask_files(room)
             )
-            for name, room in folders.items()
+            for name, room in self._folders().items()
             if name in scenes
         }
         return {"test_share": self.test_share, "rooms": digest(repr(sorted(files.items())))}
@@ -151,11 +150,10 @@ class Posed(Reader):
         upright, turn = upright_cameras(recording, chosen, self.up, self.metres_per_unit)
         try:
             size = of_frames[min(of_frames)].size()
-            sizes = size, shrunk(size, self.max_side)
             if self.tracks == "auto" or not masks.tracked:
-                made = read_untracked(masks, frames, *sizes, room_cameras(upright))
+                made = read_untracked(masks, frames, size, self.max_side, room_cameras(upright))
             else:
-                made = read_tracked(masks, frames, *sizes)
+                made = read_tracked(masks, frames, size, self.max_side)
         except InputError as error:
             raise InputError(f"{recording.path}: {str(error).removesuffix('.')}.") from None
         return FramedRoom(

@@ -72,12 +72,8 @@ class Particles:
     def furniture(self) -> list[Furniture]:
         """The objects of each particle."""
         most, rooms = int(self.number.max()), self.rooms
-        every = furniture_of(
-            self.sampler,
-            *(part[:, :most].flatten(0, 1) for part in (
-                rooms.boxes_m, rooms.object_class, self.looks
-            )),
-        )  # fmt: skip
+        parts = rooms.boxes_m, rooms.object_class, self.looks
+        every = furniture_of(self.sampler, *(part[:, :most].flatten(0, 1) for part in parts))
         found = [
             every.rows(slice(row * most, row * most + number))
             for row, number in enumerate(self.number.tolist())
@@ -273,10 +269,8 @@ class _Step:
         """True if a place adds no fault to the room of row `at` (`PlacementRules.faults`)."""
         if self.particles.rules is None:
             return True
-        rules, placed = (
-            self.particles.rules[int(self.room[at])],
-            self._furniture[int(self.rows[at])],
-        )
+        rules = self.particles.rules[int(self.room[at])]
+        placed = self._furniture[int(self.rows[at])]
         if at not in self._faults:
             self._faults[at] = rules.faults(placed)
         return rules.faults(placed.joined(candidate)) <= self._faults[at]

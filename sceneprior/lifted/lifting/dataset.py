@@ -201,9 +201,8 @@ class LiftedDataset(RoomDataset):
         error of its prototype in each pose (`explain_rays`)."""
         from sceneprior.lifted.lifting.prototype_fitting import explain_rays
 
-        margin = self._shape.margin
         looks, errors = explain_rays(
-            prototypes, self.rays, self.sizes_m, self.object_classes, margin
+            prototypes, self.rays, self.sizes_m, self.object_classes, self._shape.margin
         )
         return np.where(self.usable, looks, -1), errors
 

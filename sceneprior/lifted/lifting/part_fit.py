@@ -215,7 +215,6 @@ def _bars(guess: Guess, hangs: bool) -> Iterator[Part]:
     object on a thin post would tip over."""
     ceiling = np.array([[0, LEVELS]] * 3)
     ceiling[1] = LEVELS
-    both = ACROSS_X | ACROSS_Z
     ends = list(zip(guess.mirrored.tolist(), guess.ends, strict=True))
     for across, own in ends.copy():
         both_sides = own.copy()  # with the mirror images
@@ -223,7 +222,7 @@ def _bars(guess: Guess, hangs: bool) -> Iterator[Part]:
             if across & bit:
                 both_sides[axis] = _with_image(own[axis])
         ends += [(0, both_sides)] if across else []
-    targets = [*ends, (both, ceiling)] if hangs else ends
+    targets = [*ends, (ACROSS_X | ACROSS_Z, ceiling)] if hangs else ends
     for (one, here), (other, there) in itertools.product(ends, targets):
         last_low = np.maximum(here[:, 0], there[:, 0])
         first_high = np.minimum(here[:, 1], there[:, 1])

@@ -108,12 +108,8 @@ class RayFit:
 
     def loss(self, guess: Guess) -> float:
         """The loss that the module's docstring defines."""
-        return float(
-            _loss(
-                *guess[:3], guess.met_by, self.hits, self.hit_price, self.miss_price, self.area,
-                self.hangs,
-            )
-        )  # fmt: skip
+        prices = self.hit_price, self.miss_price
+        return float(_loss(*guess[:3], guess.met_by, self.hits, *prices, self.area, self.hangs))
 
     def faults(self, guess: Guess) -> int:
         """Number of pieces beyond one, one more for a gap to the floor or the ceiling, and one more

@@ -57,8 +57,7 @@ class Floor:
     @property
     def is_rectangle(self) -> bool:
         """True if the floor is one rectangle along the axes."""
-        low_x, low_z, high_x, high_z = self.polygon.bounds
-        whole = (high_x - low_x) * (high_z - low_z)
+        whole = self.rectangle_m[2:].prod()
         return bool(abs(whole - self.polygon.area) < 1e-6 * whole)
 
     @cached_property

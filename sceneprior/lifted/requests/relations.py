@@ -155,20 +155,18 @@ def related(
     if relation == "opposite":
         return faces & _in_sector(offset, front)
     along = np.abs(front) > np.sin(SECTOR_RAD)  # the axis of the target's front
-    level = np.where(along, gaps, -np.inf).max(axis=-1) < 0
+    ahead = np.where(along, gaps, -np.inf).max(axis=-1)
     across = np.where(along, -np.inf, gaps).max(axis=-1)
     if relation == "beside":
-        return np.asarray(level & (across >= -0.05) & (across <= BESIDE_M))
+        return np.asarray((ahead < 0) & (across >= -0.05) & (across <= BESIDE_M))
     if relation == "at the foot of":
-        ahead = np.where(along, gaps, -np.inf).max(axis=-1)
         before = (offset * front).sum(axis=-1) > 0
         return np.asarray(before & (across < 0) & (ahead >= -0.05) & (ahead <= BESIDE_M))
     assert relation == "under", relation
     top = here[..., 1] + here[..., 4] / 2
     below = top <= there[..., 1] - there[..., 4] / 2 + 1e-3
     if label == "window":
-        before = np.where(along, gaps, -np.inf).max(axis=-1) <= REACH_M
-        return np.asarray(before & (across < 0) & below)
+        return np.asarray((ahead <= REACH_M) & (across < 0) & below)
     within = (np.abs(offset) <= there[..., [3, 5]] / 2).all(axis=-1)
     within |= (np.abs(offset) <= here[..., [3, 5]] / 2).all(axis=-1)
     return np.asarray(within & (below | ("lamp" in label)))
@@ -179,9 +177,8 @@ def _in_sector(
 ) -> Bool[np.ndarray, "subjects targets"]:
     """True where an offset lies within `SECTOR_RAD` of the front."""
     ahead = (away_m * front).sum(axis=-1)
-    return np.asarray(ahead >= np.cos(SECTOR_RAD) * np.linalg.norm(away_m, axis=-1) - 1e-9) & (
-        ahead > 0
-    )
+    least = np.cos(SECTOR_RAD) * np.linalg.norm(away_m, axis=-1) - 1e-9
+    return np.asarray((ahead >= least) & (ahead > 0))
 
 
 def beside_bed(subjects: Furniture, bed: Piece) -> Float[np.ndarray, "subjects 2"]:

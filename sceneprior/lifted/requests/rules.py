@@ -247,13 +247,8 @@ class Paths:
     def meet(self, strip: shapely.Polygon, walked: Bool[np.ndarray, "doors x z"]) -> bool:
         """True if paths lead from every door to a strip of floor along the axes."""
         low_x, low_z, high_x, high_z = strip.bounds
-        x, z, width, depth = (
-            (low_x + high_x) / 2,
-            (low_z + high_z) / 2,
-            high_x - low_x,
-            high_z - low_z,
-        )
-        cells = self._cells(np.array([x, 0.0, z, width, 0.0, depth]), 0.0)
+        x, z = (low_x + high_x) / 2, (low_z + high_z) / 2
+        cells = self._cells(np.array([x, 0.0, z, high_x - low_x, 0.0, high_z - low_z]), 0.0)
         return bool(walked[:, *cells].any(axis=(1, 2)).all())
 
     def _cells(self, box_m: Float[np.ndarray, "6"], margin_m: float) -> tuple[slice, slice]:
