@@ -3,9 +3,10 @@
 Masks do not show a front directly, and furniture such as a wardrobe or a nightstand is symmetric:
 its masks fit several poses about equally well, and which of them fits best is chance. So poses are
 chosen by the rooms. Cues tell how likely each side of an object is its back: a wall is near, other
-furniture is near, nothing could open there, a table or what people watch is on that side, the side
-is higher than the others (a backrest, a headboard), and it is wide. The back of a prototype and the
-poses of its objects are those of the highest sum of these cues and of the likelihood of the rays.
+furniture is near, nothing could open there, a table is on that side or on the opposite one, what
+people watch is on that side, the side is higher than the others (a backrest, a headboard), and it
+is wide. The back of a prototype and the poses of its objects are those of the highest sum of these
+cues and of the likelihood of the rays.
 """
 
 from collections.abc import Sequence
@@ -25,17 +26,18 @@ from sceneprior.lifted.sampler.frames import GRAZE_M, OUTWARD, own_sides, shared
 FURTHEST_M = 1.0
 """Length to which gaps are clipped."""
 WEIGHTS: dict[str, tuple[float, ...]] = {
-    "storage": (-1.77, 0.24, -1.59, 0.04, -0.36, 0.05, 2.35),
-    "chair": (-1.50, 0.91, -0.53, 1.71, 0.30, 2.74, -0.81),
-    "sofa": (-1.43, 0.44, -0.96, 0.09, -1.29, 1.20, 3.11),
-    "bed": (-1.66, 0.59, -1.28, 0.06, -0.18, 1.14, -2.27),
+    "storage": (-1.69, 0.36, -1.37, 0.07, 0.10, -0.55, 0.05, 2.45),
+    "chair": (-1.18, 1.05, -0.05, 1.29, -2.53, -0.12, 1.57, -0.62),
+    "sofa": (-1.46, 0.33, -1.17, 0.13, 0.09, -0.66, 1.64, 2.49),
+    "bed": (-1.71, 0.30, -1.49, 0.05, 0.12, -0.30, 1.53, -2.67),
 }
 """Weights in the logit of a side being the back, by kind of furniture (`kind_of`): the gaps to a
-wall, to furniture of any height, to a wall or furniture of the same height, and to a table (metres,
-up to `FURTHEST_M`); 1 if a screen or a bed is on that side; the side's height above the mean of all
-four, relative to the object's; and the log of its width over the mean of both. Fitted to the true
-fronts of training rooms (docs/experiments/2026-11-27-fronts-by-the-room.md), never to a user's."""
-ROOM_CUES = 5
+wall, to furniture of any height, to a wall or furniture of the same height, to a table, and from
+the opposite side to a table (metres, up to `FURTHEST_M`); 1 if a screen or a bed is on that side;
+the side's height above the mean of all four, relative to the object's; and the log of its width
+over the mean of both. Fitted to the true fronts of training rooms
+(docs/experiments/2026-11-27-fronts-by-the-room.md), never to a user's."""
+ROOM_CUES = 6
 """Number of cues of the room; the others are of the prototype."""
 PER_RAY_SHARE = 30.0
 """Log-likelihood that an object loses for each unit of its rays explained wrongly: a pose that
@@ -147,12 +149,14 @@ def room_cues(
     away = centre.unsqueeze(1) - centre.unsqueeze(2)
     ahead = away @ torch.from_numpy(OUTWARD).to(away).T > SECTOR * away.norm(dim=-1, keepdim=True)
     screens = (ahead & (others & watched).unsqueeze(-1)).any(dim=2)
+    to_table = _gaps_m(rooms, others & tables)
     return torch.stack(
         [
             to_wall,
             _gaps_m(rooms, others),
             blocked,
-            _gaps_m(rooms, others & tables),
+            to_table,
+            to_table.roll(QUARTERS // 2, dims=-1),
             screens.float(),
         ],
         dim=-1,

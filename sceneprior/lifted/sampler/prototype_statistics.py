@@ -27,6 +27,9 @@ gives the val rooms' sizes the highest likelihood
 COMMON = 2
 """Number of objects that an entry must have, unless no entry of its prototype has as many. An
 unusual size is more often an error of lifting than truly rare."""
+FAR_SIZE = np.log(2)
+"""Largest difference between the log extents of an object and the medians of its prototype.
+Objects that differ more are slabs, or two objects in one box: errors of lifting."""
 FRAMES = 8
 """Noisy rectangles per training room to which the mixture is fitted."""
 LEAST_VARIANCE = 0.004
@@ -105,6 +108,9 @@ def find_sizes(
         own_m, own_bottoms_m = objects_m[own], heights_m[own]
         if not len(own_m):
             own_m, own_bottoms_m = prototypes.sizes_m[row, None], np.zeros(1)
+        far = abs(np.log(own_m) - np.median(np.log(own_m), axis=0)).max(axis=1)
+        near = far <= max(FAR_SIZE, far.min())
+        own_m, own_bottoms_m = own_m[near], own_bottoms_m[near]
         entry = np.zeros(1, dtype=int)
         if len(own_m) > 1:
             joined = linkage(np.log(own_m), "complete", "chebyshev")

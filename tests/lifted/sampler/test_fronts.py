@@ -86,6 +86,16 @@ def test_wardrobes_turn_their_backs_to_their_walls():
     assert oriented(at_walls, kinds, errors).looks.tolist() == [[0, 0]]
 
 
+def test_a_chair_turns_its_back_away_from_its_desk():
+    desk, seat = [0.0, 0.5, -2.5, 1.0, 1.0, 1.0], [0.0, 0.5, -1.4, 1.0, 1.0, 1.0]
+    one = replace(room(desk, seat, looks=[8, 0]), object_class=torch.tensor([[3, 4]]))
+    to_walls = torch.from_numpy(gaps_to_walls(np.array([desk, seat]), FLOOR))[None]
+    cube = np.ones((CELLS,) * 3, dtype=bool)
+    kinds = prototypes(cube, cube)._replace(object_class=np.array([4, 3]))
+    found = orient(one, to_walls, torch.zeros(1, 2, POSES).double(), kinds, (*NAMES, "chair"))
+    assert side_of(found.looks, found.backs)[0, 1] == 2  # the desk is at low z
+
+
 def test_gaps_of_a_room_by_hand():
     boxes_m = [0.0, 0.5, 2.5, 1.0, 1.0, 1.0], [0.0, 0.5, 1.4, 1.0, 1.0, 1.0]
     plain = room(*boxes_m, looks=[8, 0])
@@ -95,12 +105,13 @@ def test_gaps_of_a_room_by_hand():
     beside = gaps_to_walls(np.array(boxes_m), FLOOR[:2])  # the other sides of the rectangle
     np.testing.assert_allclose(beside, [[5, 2.5, 0, 0], [3.9, 2.5, 1.1, 0]], atol=1e-6)
     cues = room_cues(rooms, torch.from_numpy(to_walls)[None], NAMES)[0]
-    walls, furniture, blocked, table, screens = cues.unbind(dim=-1)
+    walls, furniture, blocked, table, opposite, screens = cues.unbind(dim=-1)
     assert walls.tolist() == [[1, 1, 0, 1], [1, 1, 1, 1]]
     near = pytest.approx(0.1)
     assert furniture.tolist() == [[near, 1, 1, 1], [1, 1, near, 1]]
     assert blocked.tolist() == [[near, 1, 0, 1], [1, 1, near, 1]]
     assert table.tolist() == [[1, 1, 1, 1], [1, 1, near, 1]]
+    assert opposite.tolist() == [[1, 1, 1, 1], [near, 1, 1, 1]]
     assert not screens.any()
 
 

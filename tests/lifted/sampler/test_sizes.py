@@ -84,3 +84,20 @@ def test_a_prototype_with_one_object_or_none_has_one_size():
     assert not floor_m.any() and torch.equal(ones, wanted) and torch.equal(numbers, wanted)
     first = int(alone.looks[1, 0])
     assert_close(found_m[first // POSES, 0].sort().values, alone.boxes_m[1, 0, 3:].sort().values)
+
+
+def test_slabs_are_not_sizes_of_their_prototype():
+    """Two objects of one prototype become 3 times as thin: the other entries stay as they were."""
+    rooms = sampler_rooms(40)
+    first = rooms.rooms.looks // POSES == int(rooms.rooms.looks[0, 0]) // POSES
+    slabs = (first & rooms.rooms.is_object).nonzero()[:2]
+    boxes_m = rooms.rooms.boxes_m.clone()
+    boxes_m[slabs[:, 0], slabs[:, 1], 3] /= 3
+    thin = replace(rooms.rooms, boxes_m=boxes_m)
+    without = rooms.rooms.is_object.clone()
+    without[slabs[:, 0], slabs[:, 1]] = False
+    kept = replace(rooms.rooms, is_object=without)
+    for found, wanted in zip(
+        find_sizes(thin, rooms.prototypes), find_sizes(kept, rooms.prototypes), strict=True
+    ):
+        assert torch.equal(found, wanted)
