@@ -7,7 +7,7 @@ import numpy as np
 
 from data_prep.homes.layout import Layout, Piece, empty_room, is_liveable, yaw_at
 from data_prep.homes.place import Furnisher
-from sceneprior.furniture.catalog import STYLES, Catalog
+from sceneprior.furniture.catalog import STYLES, Catalog, Model
 
 Offers = dict[str, tuple[int, float]]
 """Number of pieces and sampling weight per group of pieces, such as "desk and chair"."""
@@ -133,12 +133,12 @@ def draw_extras(
     return groups
 
 
-def storage(clearance: float) -> Callable[[Furnisher, str], Piece | None]:
-    """Make a rule that places one piece of the class named by the group, its back to a wall: often
-    in a row with other storage, rarely at the wall of the anchor."""
+def storage(clearance: float, above: float = 0.0) -> Callable[[Furnisher, str], Piece | None]:
+    """Make a rule that places one piece of the class named by the group, wider than `above`, its
+    back to a wall: often in a row with other storage, rarely at the wall of the anchor."""
 
     def place(room: Furnisher, group: str) -> Piece | None:
-        models = room.catalog[group]
+        models = room.models(group, above=above)
         for piece in room.named(*STORAGE) if room.rng.random() < IN_ROW else ():
             for side in (-1, 1):
                 if placed := room.beside(piece, room.pick(models), side, clearance):
@@ -174,8 +174,11 @@ def reading_corner(room: Furnisher, group: str) -> Piece | None:
     return next(filter(None, (room.beside(chair, small, side) for side in (-1, 1))), None)
 
 
-def opposite_the_anchor(room: Furnisher, group: str) -> Piece | None:
-    """Place a piece of the class named by the group at the wall that the bed or the sofa faces."""
+def opposite_the_anchor(
+    room: Furnisher, group: str, models: list[Model] | None = None
+) -> Piece | None:
+    """Place a piece of the class named by the group, or one of `models`, at the wall that the bed
+    or the sofa faces."""
     anchor = room.anchor
     facing = [
         wall
@@ -186,4 +189,4 @@ def opposite_the_anchor(room: Furnisher, group: str) -> Piece | None:
         return None
     wall = max(facing, key=lambda wall: wall.length_m)
     where = float(np.abs(wall.direction) @ np.abs((anchor.x, anchor.z) - wall.start_m))
-    return room.against_wall(room.catalog[group], 0.6, [wall], where=where, tries=15)
+    return room.against_wall(models or room.catalog[group], 0.6, [wall], where=where, tries=15)

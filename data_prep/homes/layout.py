@@ -124,6 +124,12 @@ def overlaps(a: Rect, b: Rect, gap: float = 0.0) -> bool:
     return in_x and a[1] < b[3] + gap and b[1] < a[3] + gap
 
 
+def grown(rect: Rect, margin: float) -> Rect:
+    """The rectangle with all sides moved outwards."""
+    x0, z0, x1, z1 = rect
+    return x0 - margin, z0 - margin, x1 + margin, z1 + margin
+
+
 @dataclass
 class Layout:
     """A room being furnished."""
@@ -181,9 +187,7 @@ class Layout:
         """Test whether the piece fits; with `crowding`, it may stand on floor kept for seats."""
         rect = piece.rect
         hangs = piece.y > 0
-        if not self._holds(rect, 0.004) or piece.top > self.height - (
-            0 if hangs else CEILING_GAP_M
-        ):
+        if not self.holds(rect, 0.004) or piece.top > self.height - (0 if hangs else CEILING_GAP_M):
             return False
         for other in self.pieces:
             apart = piece.y >= other.top or other.y >= piece.top
@@ -202,14 +206,14 @@ class Layout:
         if clearance:
             clear = piece.clearance(clearance)
             standing = [other.rect for other in self.pieces if other.y == 0]
-            if not self._holds(clear) or any(overlaps(clear, other) for other in standing):
+            if not self.holds(clear) or any(overlaps(clear, other) for other in standing):
                 return False
             seat = piece.model.name in SEATS
             (self.kept_for_seats if seat else self.kept_clear).append(clear)
         self.pieces.append(piece)
         return True
 
-    def _holds(self, rect: Rect, gap: float = 0.0) -> bool:
+    def holds(self, rect: Rect, gap: float = 0.0) -> bool:
         """Test whether the rectangle lies inside the room, at least `gap` from its walls."""
         x0, z0, x1, z1 = rect
         if x0 < gap or z0 < gap or x1 > self.width - gap or z1 > self.depth - gap:

@@ -204,15 +204,17 @@ class Furnisher:
         lowest: float,
         angled: float,
         yaw_rad: float = 0.0,
+        spread: float = 0.05,
     ) -> Piece | None:
-        """Hang a lamp from the ceiling above `place`, no part of it below `lowest`."""
+        """Hang a lamp from the ceiling above `place`, no part of it below `lowest`; its place
+        varies with the standard deviation `spread`."""
 
         def propose(piece: Piece) -> Piece | None:
             bottom = self.layout.height - piece.size_m[1]
             if bottom < lowest:
                 return None
             yaw = yaw_rad + self.random_turn(angled)
-            x, z = place[0] + self.rng.normal(0, 0.05), place[1] + self.rng.normal(0, 0.05)
+            x, z = place[0] + self.rng.normal(0, spread), place[1] + self.rng.normal(0, spread)
             return piece.at(x, z, yaw, bottom)
 
         return self._try(models, 20, propose)
