@@ -17,7 +17,8 @@ from data_prep.front.houses import read_house
 from data_prep.front.recipe import boxes_m, load_recipe
 from data_prep.homes.bedroom import BEDROOM
 from data_prep.homes.furnish import furnish
-from data_prep.homes.layout import FREE_SHARE
+from data_prep.homes.layout import FREE_SHARE, grown
+from data_prep.homes.living import LIVING_ROOM, PULLED_OUT_M
 from data_prep.homes.make import make_homes
 from sceneprior.core.files import only_writer
 from sceneprior.furniture.catalog import make_catalog
@@ -158,3 +159,35 @@ def test_boxes_stand_apart_and_inside_with_room_to_walk(rooms):
             if low[1] < 0.5
         ]
         assert sum(standing) <= (1 - FREE_SHARE) * room.floor.area + 1e-3
+
+
+def test_living_rooms_stand_as_people_use_them():
+    catalog = make_catalog(0, "front3d_living")
+    chairs = coffee_tables = lamps = 0
+    for room in range(40):
+        layout = furnish(LIVING_ROOM, catalog, np.random.default_rng(room), (room + 0.5) / 40)
+        sofa, standing = layout.pieces[0], [each for each in layout.pieces if each.y == 0]
+        named = {each.model.name: each for each in standing}
+        tables = [each for each in standing if each.model.name in ("table", "coffee_table")]
+        dining = [each for each in standing if "Dining Chair" in each.model.category]
+        floor = shapely.Polygon(layout.outline)
+        for chair in dining:  # it can be pulled out
+            others = [each for each in standing if each not in (*dining, *tables)]
+            rest = shapely.union_all([shapely.box(*each.rect) for each in others])
+            assert shapely.box(*chair.rect).distance(rest) > PULLED_OUT_M - 1e-9
+            assert floor.covers(shapely.box(*grown(chair.rect, PULLED_OUT_M - 1e-9)))
+        if "tv_stand" in named:
+            assert named["tv_stand"].size_m[1] < 0.75
+        if "coffee_table" in named:  # before the middle of the sofa
+            ahead = np.array([np.sin(sofa.yaw_rad), np.cos(sofa.yaw_rad)])
+            away = np.array([named["coffee_table"].x - sofa.x, named["coffee_table"].z - sofa.z])
+            assert away @ ahead > 0 and abs(away @ (ahead[1], -ahead[0])) < 0.05
+        hanging = np.array([(each.x, each.z) for each in layout.pieces if each.y > 0])
+        tops = np.array([(each.x, each.z) for each in tables if each.size_m[0] > 0.5])
+        for own, lamp in enumerate(hanging):
+            rest = np.delete(hanging, own, axis=0)
+            over = len(tops) and np.linalg.norm(tops - lamp, axis=1).min() < 0.2
+            assert over or not len(rest) or np.linalg.norm(rest - lamp, axis=1).min() > 1.2
+        chairs, lamps = chairs + len(dining), lamps + len(hanging)
+        coffee_tables += "coffee_table" in named
+    assert chairs > 50 and coffee_tables > 30 and lamps > 30
