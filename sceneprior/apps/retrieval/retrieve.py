@@ -27,7 +27,6 @@ from sceneprior.core.parallel import map_blocks
 from sceneprior.core.repeatable import single_threaded
 from sceneprior.core.scene import Mesh, Scene, SceneObject, quarter_turned
 from sceneprior.core.surfaces import chamfer_mean, surface_points
-from sceneprior.lifted.requests.wishes import BY_FRONT
 from sceneprior.render.appearance import box_mesh
 from sceneprior.render.silhouettes.cpu.kernels import thread_count
 
@@ -38,12 +37,6 @@ ROUNDS = ((16, 1 / 3), (4, None))
 candidates; None keeps `KEEP`."""
 KEEP = 16
 """Candidates (model and turn) compared by all points."""
-OTHER_TURN = 1.2
-"""Factor on the distances of models whose turn differs from the object's known yaw. Without the
-factor, a cupboard facing backwards has only 1.0 to 1.1 times the distance of one facing forwards; a
-chair has 1.5 times."""
-SURE = 0.5
-"""Minimum confidence at which a yaw counts as known."""
 BLOCK = 32
 """Rooms of a task."""
 _BLOCK = 2**16
@@ -63,22 +56,20 @@ class Retrieved(NamedTuple):
 def retrieve(scene: Scene, models: CadModels, keep: Collection[int] = ()) -> Scene:
     """Replace every object's mesh and materials by those of the most similar CAD model.
 
-    The model's turn becomes the object's yaw (`SceneObject.turned`). Models keep the known yaws of
-    a room that fulfils wishes about fronts, such as "chair facing desk". `extra["retrieval"]` holds
-    {"model_id", "turn_deg", "distance_m"} for each object, in the order of the objects. The entry
-    is None for a class without models; such an object keeps its mesh, extruded together with its
-    box.
+    A model has the object's yaw if it is known and a quarter turn; otherwise its turn becomes the
+    object's yaw (`SceneObject.turned`). `extra["retrieval"]` holds {"model_id", "turn_deg",
+    "distance_m"} for each object, in the order of the objects. The entry is None for a class
+    without models; such an object keeps its mesh, extruded together with its box.
 
     Args:
         keep: Indices of objects that stay as they are; their entries are None.
     """
     objects: list[SceneObject] = []
     found: list[dict[str, object] | None] = []
-    strict = _asks_for_fronts(scene)
     for row, item in enumerate(scene.objects):
         box, told = item if row in keep else extruded(item), None
         if row not in keep and (of_class := models.of_class(item.label)):
-            best = most_similar(box, of_class, strict)
+            best = most_similar(box, of_class)
             mesh = placed(models.load(best.model_id), box, best.turn_deg)
             textured = tuple(
                 part._replace(mesh=placed(part.mesh, box, best.turn_deg))
@@ -168,22 +159,11 @@ def placed(unit: Mesh, item: SceneObject, turn_deg: int) -> Mesh:
     return Mesh(turned * np.asarray(item.size_m) + np.asarray(item.center_m), unit.faces)
 
 
-def _asks_for_fronts(scene: Scene) -> bool:
-    """True if a wish in `extra` that holds is about the front of an object."""
-    wishes = scene.extra.get("wishes")
-    return isinstance(wishes, list) and any(  # a file may hold anything
-        f" {relation}" in str(each.get("wish"))
-        for each in wishes
-        if isinstance(each, dict) and each.get("holds") is True
-        for relation in BY_FRONT
-    )
-
-
-def most_similar(item: SceneObject, models: ClassModels, strict: bool = False) -> Retrieved:
+def most_similar(item: SceneObject, models: ClassModels) -> Retrieved:
     """The model and turn of a class that are nearest to an object by Chamfer distance.
 
-    If the object's yaw is known and a quarter turn, the distances of models at other turns are
-    multiplied by `OTHER_TURN`; if `strict`, these models are left out.
+    If the object's yaw is known and a quarter turn, models at other turns are left out: a cupboard
+    that faces backwards is nearly as near as one that faces forwards.
     """
     # Turning the object back by each quarter turn, instead of turning the models, gives the same
     # distances, and the models' points are used as stored.
@@ -191,9 +171,8 @@ def most_similar(item: SceneObject, models: ClassModels, strict: bool = False) -
     back = [quarter_rotation(quarters).T for quarters in range(QUARTERS)]
     size_m = np.asarray(item.size_m, dtype=np.float64)
     views = [(at_center @ turn.T, np.abs(turn @ size_m)) for turn in back]
-    known = _known_turn(item, 0.0 if strict else SURE)
     choices = np.arange(len(models.model_ids) * QUARTERS)
-    if strict and known is not None:
+    if (known := _known_turn(item)) is not None:
         choices = choices[choices % QUARTERS == known]
     for step, share in ROUNDS:
         going_on = max(KEEP, int(len(choices) * share) if share else 0)
@@ -207,15 +186,14 @@ def most_similar(item: SceneObject, models: ClassModels, strict: bool = False) -
         model, turn = divmod(int(choice), QUARTERS)
         points, size = views[turn]
         distances.append(chamfer_mean(points, models.points[model] * size, trees[turn]))
-    other = known is not None and choices % QUARTERS != known
-    best = int(np.argmin(np.where(other, OTHER_TURN, 1.0) * distances))
+    best = int(np.argmin(distances))
     model, turn = divmod(int(choices[best]), QUARTERS)
     return Retrieved(models.model_ids[model], 90 * turn, distances[best])
 
 
-def _known_turn(item: SceneObject, sure: float) -> int | None:
-    """An object's yaw in quarter turns; None if the yaw is less than `sure`, or no quarter turn."""
-    if item.turned is None or item.turned.confidence < sure:
+def _known_turn(item: SceneObject) -> int | None:
+    """An object's yaw in quarter turns; None if it is unknown or no quarter turn."""
+    if item.turned is None:
         return None
     quarters = item.turned.yaw_rad / (np.pi / 2)
     return round(quarters) % QUARTERS if abs(quarters - round(quarters)) < 1e-3 else None

@@ -215,7 +215,7 @@ def test_rooms_without_objects_and_objects_without_volume_have_defined_answers(m
     assert made.extra["retrieval"][2]["model_id"] == "plain"  # by its box
 
 
-def test_a_known_yaw_decides_between_turns_that_fit_alike():
+def test_models_keep_a_known_yaw():
     """A cupboard whose doors stand out by 1 cm, decoded as a box."""
     cupboard = blocks(((0, 0.5, 0), (1, 1, 0.5)), ((0, 0.5, 0.255), (0.9, 0.9, 0.01)))
     models = cad_models(wardrobe={"cupboard": cupboard})
@@ -226,4 +226,8 @@ def test_a_known_yaw_decides_between_turns_that_fit_alike():
     for quarters in range(4):
         item = replace(box, turned=quarter_turned(size, quarters))
         (made,) = retrieve(room(item), models).objects
+        assert made.turned == item.turned
+        # Even if the mesh is that of a cupboard which faces backwards.
+        mesh = placed(models.load("cupboard"), item, 90 * (quarters + 2) % 360)
+        (made,) = retrieve(room(replace(item, mesh=mesh)), models).objects
         assert made.turned == item.turned
