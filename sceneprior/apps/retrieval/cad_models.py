@@ -70,6 +70,11 @@ class ClassModels:
     points: Float[np.ndarray, "models points 3"]
     """Points on the surface of each model, which is scaled to fill [-0.5, 0.5]^3."""
 
+    def only(self, model_id: str) -> "ClassModels":
+        """One of the models."""
+        row = self.model_ids.index(model_id)
+        return ClassModels((model_id,), self.points[row : row + 1])
+
 
 @dataclass(frozen=True)
 class CadModels:

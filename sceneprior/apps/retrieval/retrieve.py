@@ -37,6 +37,8 @@ ROUNDS = ((16, 1 / 3), (4, None))
 candidates; None keeps `KEEP`."""
 KEEP = 16
 """Candidates (model and turn) compared by all points."""
+ALIKE = 1.3
+"""Largest ratio of the extents of two objects of a class that get the same model, if asked for."""
 BLOCK = 32
 """Rooms of a task."""
 _BLOCK = 2**16
@@ -53,7 +55,9 @@ class Retrieved(NamedTuple):
     """Chamfer distance between the object and the model in metres, by `chamfer_mean`."""
 
 
-def retrieve(scene: Scene, models: CadModels, keep: Collection[int] = ()) -> Scene:
+def retrieve(
+    scene: Scene, models: CadModels, keep: Collection[int] = (), alike: bool = False
+) -> Scene:
     """Replace every object's mesh and materials by those of the most similar CAD model.
 
     A model has the object's yaw if it is known and a quarter turn; otherwise its turn becomes the
@@ -63,13 +67,17 @@ def retrieve(scene: Scene, models: CadModels, keep: Collection[int] = ()) -> Sce
 
     Args:
         keep: Indices of objects that stay as they are; their entries are None.
+        alike: Objects of a class whose sizes are similar (`ALIKE`) get the model of the first of
+            them, so that two nightstands, or the chairs of a table, are of one kind.
     """
     objects: list[SceneObject] = []
-    found: list[dict[str, object] | None] = []
+    found: list[dict[str, Any] | None] = []
     for row, item in enumerate(scene.objects):
         box, told = item if row in keep else extruded(item), None
         if row not in keep and (of_class := models.of_class(item.label)):
-            best = most_similar(box, of_class)
+            twins = zip(objects, found, strict=True) if alike else ()
+            ids = [told["model_id"] for item, told in twins if told and _are_alike(item, box)]
+            best = most_similar(box, of_class.only(ids[0]) if ids else of_class)
             mesh = placed(models.load(best.model_id), box, best.turn_deg)
             textured = tuple(
                 part._replace(mesh=placed(part.mesh, box, best.turn_deg))
@@ -84,31 +92,43 @@ def retrieve(scene: Scene, models: CadModels, keep: Collection[int] = ()) -> Sce
     return replace(scene, objects=tuple(objects), extra={**scene.extra, "retrieval": found})
 
 
+def _are_alike(first: SceneObject, second: SceneObject) -> bool:
+    sides = [[item.size_m[1], *sorted(item.size_m[::2])] for item in (first, second)]
+    ratios = np.divide(*np.maximum(sides, 1e-9))
+    return first.label == second.label and bool(np.abs(np.log(ratios)).max() < np.log(ALIKE))
+
+
 def retrieve_all(
     scenes: Sequence[Scene], models: CadModels, then: Then | None = None
 ) -> list[Scene]:
     """Apply `retrieve` to many scenes, and `then` as in `Prior.sample`, in tasks of `BLOCK`."""
-    some = partial(_retrieve_some, models, (), then)
+    some = partial(_retrieve_some, models, (), False, then)
     return map_blocks(some, scenes, BLOCK, "choosing models")
 
 
 def _retrieve_some(
-    models: CadModels, keep: Collection[int], then: Then | None, scenes: Sequence[Scene], first: int
+    models: CadModels,
+    keep: Collection[int],
+    alike: bool,
+    then: Then | None,
+    scenes: Sequence[Scene],
+    first: int,
 ) -> list[Scene]:
     with single_threaded(), ThreadPoolExecutor(thread_count()) as pool:
-        found = [*pool.map(lambda scene: retrieve(scene, models, keep), scenes)]
+        found = [*pool.map(lambda scene: retrieve(scene, models, keep, alike), scenes)]
     return found if then is None else then(found, first)
 
 
 def with_models(scenes: Sequence[Scene], given: Sequence[SceneObject] = ()) -> list[Scene]:
-    """Scenes with the package's own models in place of their meshes (`retrieve`).
+    """Scenes with the package's own models in place of their meshes (`retrieve`), alike where
+    sizes are.
 
     Args:
         given: Objects given by the user, which come first in every scene; those with a mesh keep
             it.
     """
     keep = [row for row, item in enumerate(given) if item.mesh is not None]
-    return _retrieve_some(made_models(), keep, None, scenes, 0)
+    return _retrieve_some(made_models(), keep, True, None, scenes, 0)
 
 
 def retrieval_report(scenes: Sequence[Scene], models: CadModels) -> dict[str, Any]:

@@ -84,7 +84,7 @@ class Shown:
         """The room with a CAD model in place of the picked object, or of all if none is picked."""
         rows = range(len(self.scene.objects))
         keep = [row for row in rows if self.picked is not None and row != self.picked]
-        return replace(self, scene=retrieve(self.scene, models, keep))
+        return replace(self, scene=retrieve(self.scene, models, keep, alike=True))
 
 
 class Folder:

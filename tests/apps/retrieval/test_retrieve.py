@@ -231,3 +231,15 @@ def test_models_keep_a_known_yaw():
         mesh = placed(models.load("cupboard"), item, 90 * (quarters + 2) % 360)
         (made,) = retrieve(room(replace(item, mesh=mesh)), models).objects
         assert made.turned == item.turned
+
+
+def test_objects_of_similar_sizes_get_one_model_if_asked_for(rng):
+    sofas = {f"m{row}": random_furniture(rng) for row in range(6)}
+    models = cad_models(1024, sofa=sofas)
+    items = []
+    for row, size in enumerate([(1.0, 0.8, 0.6), (0.7, 0.8, 1.1), (1.9, 0.8, 0.6)]):
+        item = SceneObject("sofa", (3.0 * row, 0.4, 0.0), size)
+        items.append(replace(item, mesh=placed(models.load(f"m{row}"), item, 0)))
+    for alike, wanted in ((False, ["m0", "m1", "m2"]), (True, ["m0", "m0", "m2"])):
+        told = retrieve(room(*items), models, alike=alike).extra["retrieval"]
+        assert [each["model_id"] for each in told] == wanted
