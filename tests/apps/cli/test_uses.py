@@ -53,7 +53,7 @@ def test_rooms_that_lack_something_are_kept_and_counted(command, tmp_path, monke
         "-n",
         8,
         "--floor",
-        "2.3x2.3",
+        "2.4x2.4",
         "--want",
         want,
     ]
