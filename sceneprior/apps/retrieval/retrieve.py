@@ -8,7 +8,7 @@ its box.
 All models and turns are first compared by few points, and the best candidates by all points.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -102,20 +102,15 @@ def retrieve_all(
     scenes: Sequence[Scene], models: CadModels, then: Then | None = None
 ) -> list[Scene]:
     """Apply `retrieve` to many scenes, and `then` as in `Prior.sample`, in tasks of `BLOCK`."""
-    some = partial(_retrieve_some, models, (), False, then)
+    some = partial(_retrieve_some, partial(retrieve, models=models), then)
     return map_blocks(some, scenes, BLOCK, "choosing models")
 
 
 def _retrieve_some(
-    models: CadModels,
-    keep: Collection[int],
-    alike: bool,
-    then: Then | None,
-    scenes: Sequence[Scene],
-    first: int,
+    one: Callable[[Scene], Scene], then: Then | None, scenes: Sequence[Scene], first: int
 ) -> list[Scene]:
     with single_threaded(), ThreadPoolExecutor(thread_count()) as pool:
-        found = [*pool.map(lambda scene: retrieve(scene, models, keep, alike), scenes)]
+        found = [*pool.map(one, scenes)]
     return found if then is None else then(found, first)
 
 
@@ -128,7 +123,8 @@ def with_models(scenes: Sequence[Scene], given: Sequence[SceneObject] = ()) -> l
             it.
     """
     keep = [row for row, item in enumerate(given) if item.mesh is not None]
-    return _retrieve_some(made_models(), keep, True, None, scenes, 0)
+    one = partial(retrieve, models=made_models(), keep=keep, alike=True)
+    return _retrieve_some(one, None, scenes, 0)
 
 
 def retrieval_report(scenes: Sequence[Scene], models: CadModels) -> dict[str, Any]:
