@@ -94,7 +94,7 @@ def _coffee_table(room: Furnisher, group: str) -> Piece | None:
 
 
 def _tv_stand(room: Furnisher, group: str) -> Piece | None:
-    """Place a low TV stand opposite the sofa, hardly wider than it."""
+    """Place a low TV stand opposite the sofa, hardly wider than it; a small one if none is."""
     low = _low(room.models(group, below=room.anchor.size_m[0] + 0.3), 0.7)
     return opposite_the_anchor(room, group, low or room.smallest(group, 3))
 
@@ -176,8 +176,8 @@ def _seats(room: Furnisher, group: str) -> bool:
 def _add_beside(
     room: Furnisher, table: Piece, seat: Piece, side: int, angled: float = 0.0
 ) -> Piece | None:
-    """Add a seat that faces a side of the coffee table, beyond the end of the sofa rather than in
-    front of it, and wholly in front of the sofa's front edge if it is a long one."""
+    """Add a seat that faces a side of the coffee table, about beyond the end of the sofa (at most
+    0.7 m from the table), and wholly in front of the sofa's front edge."""
     sofa, half_table_m = room.anchor, table.size_m[0] / 2
     ahead_m = float(np.hypot(table.x - sofa.x, table.z - sofa.z)) - sofa.size_m[2] / 2
     sideways = side * max(0.0, seat.size_m[0] / 2 + 0.1 - ahead_m)

@@ -83,7 +83,7 @@ ASKED: dict[str, dict[str, Any]] = {
     },
     "given_unknown": {"objects": [box("piano")]},
     "given_centimetres": {"objects": [box(cm=100.0)]},
-    "area": {"floor": "3x2", "want": {"double_bed": 4}},
+    "area": {"floor": "3x2", "want": {"double_bed": 9}},
     "openings_on_any_floor": {"openings": "window@north," * 19 + "window@north"},
     "no_place": {"floor": "0.6x6", "want": {"double_bed": 1}},
     "latents": {"floor": "4x3", "distribution": "paper"},

@@ -2,8 +2,8 @@
 
 A box whose centre is at most 1 m high is extruded to the floor. Every CAD model of the object's
 class is scaled into the box, turned by 0, 90, 180 and 270 degrees, and compared with the object's
-mesh; the model with the smallest Chamfer distance is taken. An object without a mesh is compared by
-its box.
+mesh; the model with the smallest Chamfer distance is taken. If the object's yaw is known, models
+have it. An object without a mesh is compared by its box.
 
 All models and turns are first compared by few points, and the best candidates by all points.
 """
@@ -93,9 +93,11 @@ def retrieve(
 
 
 def _are_alike(first: SceneObject, second: SceneObject) -> bool:
-    sides = [[item.size_m[1], *sorted(item.size_m[::2])] for item in (first, second)]
-    ratios = np.divide(*np.maximum(sides, 1e-9))
-    return first.label == second.label and bool(np.abs(np.log(ratios)).max() < np.log(ALIKE))
+    sizes_m = first.size_m, second.size_m
+    if first.turned and second.turned:
+        sizes_m = first.turned.size_m, second.turned.size_m
+    ratios = np.divide(*np.maximum(sizes_m, 1e-9))
+    return first.label == second.label and bool(np.abs(np.log(ratios)).max() <= np.log(ALIKE))
 
 
 def retrieve_all(
@@ -115,8 +117,7 @@ def _retrieve_some(
 
 
 def with_models(scenes: Sequence[Scene], given: Sequence[SceneObject] = ()) -> list[Scene]:
-    """Scenes with the package's own models in place of their meshes (`retrieve`), alike where
-    sizes are.
+    """Scenes with the package's own models, alike where sizes are, in place of their meshes.
 
     Args:
         given: Objects given by the user, which come first in every scene; those with a mesh keep
@@ -196,7 +197,7 @@ def most_similar(item: SceneObject, models: ClassModels) -> Retrieved:
             rough = _rough_distances(views, models.points, choices, step)
             # A stable sort keeps the first of equal models on every machine.
             choices = choices[np.argsort(rough, kind="stable")[:going_on]]
-    trees = [cKDTree(points) for points, _ in views]
+    trees = {turn: cKDTree(views[turn][0]) for turn in np.unique(choices % QUARTERS)}
     distances = []
     for choice in choices:
         model, turn = divmod(int(choice), QUARTERS)

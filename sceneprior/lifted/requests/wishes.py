@@ -25,11 +25,6 @@ TO_TARGET = (
     "facing", "under", "near", "far from",
 )  # fmt: skip
 """Relations to another object, a door or a window."""
-BY_FRONT = (
-    "beside", "on both sides of", "at the foot of", "at", "opposite", "in front of", "facing",
-    "back to a wall", "with a free front",
-)  # fmt: skip
-"""Relations that depend on the front of an object."""
 RELATIONS = (*TO_TARGET, *TO_ROOM)
 OPENINGS = ("door", "window")
 """Targets that are not furniture."""

@@ -29,7 +29,8 @@ COMMON = 2
 unusual size is more often an error of lifting than truly rare."""
 FAR_SIZE = np.log(2)
 """Largest difference between the log extents of an object and the medians of its prototype.
-Objects that differ more are slabs, or two objects in one box: errors of lifting."""
+Objects that differ more are slabs, or two objects in one box, and give no size: they are errors of
+lifting. If all differ more, the nearest remain."""
 FRAMES = 8
 """Noisy rectangles per training room to which the mixture is fitted."""
 LEAST_VARIANCE = 0.004
@@ -84,9 +85,9 @@ def find_sizes(
     """Extents of the entries of each prototype, in pose 0, heights of their bottoms, at least 0,
     both in metres, and their numbers of objects.
 
-    Entries are clusters by complete linkage of the objects' log extents, cut at `SAME_SIZE`. A
-    prototype without objects has one entry, its own extents on the floor. Unused rows have extents
-    of 1 m and the number 0.
+    Entries are clusters by complete linkage of the objects' log extents, cut at `SAME_SIZE`;
+    objects of far sizes (`FAR_SIZE`) are left out. A prototype without objects has one entry, its
+    own extents on the floor. Unused rows have extents of 1 m and the number 0.
 
     Args:
         rooms: Furnished rooms with looks.
@@ -109,7 +110,7 @@ def find_sizes(
         if not len(own_m):
             own_m, own_bottoms_m = prototypes.sizes_m[row, None], np.zeros(1)
         far = abs(np.log(own_m) - np.median(np.log(own_m), axis=0)).max(axis=1)
-        near = far <= max(FAR_SIZE, far.min())
+        near = far <= max(FAR_SIZE, far.min() + 1e-9)
         own_m, own_bottoms_m = own_m[near], own_bottoms_m[near]
         entry = np.zeros(1, dtype=int)
         if len(own_m) > 1:

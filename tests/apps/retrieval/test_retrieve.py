@@ -237,9 +237,13 @@ def test_objects_of_similar_sizes_get_one_model_if_asked_for(rng):
     sofas = {f"m{row}": random_furniture(rng) for row in range(6)}
     models = cad_models(1024, sofa=sofas)
     items = []
-    for row, size in enumerate([(1.0, 0.8, 0.6), (0.7, 0.8, 1.1), (1.9, 0.8, 0.6)]):
+    for row, size in enumerate(
+        [(1.0, 0.8, 0.6), (0.7, 0.8, 1.1), (1.9, 0.8, 0.6), (0.6, 0.8, 1.0)]
+    ):
         item = SceneObject("sofa", (3.0 * row, 0.4, 0.0), size)
-        items.append(replace(item, mesh=placed(models.load(f"m{row}"), item, 0)))
-    for alike, wanted in ((False, ["m0", "m1", "m2"]), (True, ["m0", "m0", "m2"])):
+        mesh = placed(models.load(f"m{row}"), item, 90 * (row == 1))
+        # The second one is turned by a quarter; the last one has the first's sides, exchanged.
+        items.append(replace(item, mesh=mesh, turned=quarter_turned(size, row == 1)))
+    for alike, wanted in ((False, ["m0", "m1", "m2", "m3"]), (True, ["m0", "m0", "m2", "m3"])):
         told = retrieve(room(*items), models, alike=alike).extra["retrieval"]
         assert [each["model_id"] for each in told] == wanted
