@@ -120,7 +120,7 @@ def test_a_room_is_asked_for_changed_and_saved(browser, tmp_path):
 
         row = [item.label for item in page.shown.scene.objects].index("double_bed")
         bed = page.shown.scene.objects[row]
-        x, y = on_screen(page, np.add(bed.center_m, (0, bed.size_m[1] / 2, 0)))
+        x, y = on_screen(page, bed.center_m)
         move(browser, [(x, y)])
         wait_for(lambda: page.shown.picked == row, "a click picks no piece")
         click(browser, "Lock this piece")
@@ -130,8 +130,8 @@ def test_a_room_is_asked_for_changed_and_saved(browser, tmp_path):
         assert page.shown.scene.objects[0].center_m == bed.center_m
 
         before = page.shown
-        x, y = on_screen(page, np.add(bed.center_m, (0, bed.size_m[1] / 2, 0)))
-        way = np.array(on_screen(page, (0.0, bed.size_m[1], 0.0))) - (x, y)
+        x, y = on_screen(page, bed.center_m)
+        way = np.array(on_screen(page, (0.0, bed.center_m[1], 0.0))) - (x, y)
         move(browser, [(x, y) + way * t for t in (0, 0.2, 0.4, 0.6)])
         wait_for(lambda: page.shown.origin != before.origin, "the rest did not follow")
         moved = page.shown.scene.objects[0].center_m
