@@ -48,8 +48,9 @@ midway between it and the lower and the upper side of the rectangle, and at its 
 APART_M = 0.4
 """Gap between an object and the two anchors apart from it."""
 DRAWS, DENSER = 8, 4
-"""Of `DRAWS` values along each axis, the first of the `DENSER` densest is taken. Otherwise many
-unlikely anchors together would have enough weight that one of four chairs stands apart."""
+"""Numbers of values drawn along each axis, and of the densest of them, whose first is taken.
+Otherwise many unlikely anchors together would have enough weight that one of four chairs stands
+apart."""
 GAPS_M = (-0.4, -0.15, -0.05, 0.0, 0.05, 0.15, 0.4, 0.7, 1.0, 1.5, 2.0)
 """Knots of `ramps` for gaps; negative gaps are overlaps."""
 OFFSETS_M = (-1.5, -0.7, -0.3, -0.1, -0.03, 0.03, 0.1, 0.3, 0.7, 1.5)
