@@ -2,12 +2,14 @@
 
 The released network is trained on all rooms of a file of views and on 534 of them, at the same
 time, as two processes; the layout stage alone, for as long as the part may take. Each process
-writes rooms decoded from N(0, 1) and training rooms to FOLDER/sphere_ROOMS.npz. `evaluate` compares
-them with made homes, on a CPU:
+writes training rooms, rooms decoded from N(0, 1), and rooms half-way between two training rooms to
+FOLDER/sphere_ROOMS.npz. The file of views is made of shards before, and the rooms are compared with
+those of the shards after, on a CPU:
 
-    python benchmarks/gpu_sphere.py evaluate HOMES FOLDER/sphere_*.npz
+    python benchmarks/gpu_sphere.py views SHARDS FLAT.npz
+    python benchmarks/gpu_sphere.py train FLAT.npz FOLDER ROOMS cuda --seconds 480   # one training
+    python benchmarks/gpu_sphere.py evaluate SHARDS FOLDER/sphere_*.npz
 
-HOMES is the folder from which the views were prepared (`sceneprior make-homes HOMES --rooms 5000`).
 The released network is that of configs/paper/released.yaml. Read the result only where training
 rooms are decoded (a class loss below 0.05).
 """
@@ -20,6 +22,7 @@ import sys
 import time
 import traceback
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,7 +32,7 @@ from torch import Tensor, nn
 
 from sceneprior.apps.config import load_config
 from sceneprior.core.classes import label_set
-from sceneprior.core.dataset import FlatViews
+from sceneprior.core.dataset import FlatViews, ViewDataset
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.settings import find_config
 from sceneprior.core.views import SceneViews
@@ -44,8 +47,10 @@ if TYPE_CHECKING:
 
 LABELS = "front3d_bedroom"
 FEW_ROOMS = 534
-VIEWS, BATCH, SHOWN_S, WRITES_S = 20, 128, 12.0, 12.0
+VIEWS_KEPT, VIEWS, BATCH, SHOWN_S, WRITES_S = 24, 20, 128, 12.0, 12.0
 RATE, LATENT_RATE, CLIP = 3e-4, 1e-4, 1.0
+DECODED = ("any", "between", "train")
+"""Rooms from N(0, 1), half-way between two training rooms, and training rooms."""
 SMALL = ("model.width=32", "model.decoder.hidden=32", "model.decoder.heads=2")
 """Changes for a trial on a CPU."""
 
@@ -63,7 +68,8 @@ def sphere(setup: "Setup") -> None:
         until = min(until, time.time() + 60)
     children = {}
     for count in (rooms, min(FEW_ROOMS, rooms // 2)):
-        words = [str(setup.flat), str(setup.folder), str(count), f"{until:.1f}", setup.device]
+        words = [str(setup.flat), str(setup.folder), str(count), setup.device]
+        words += ["--seconds", f"{until - time.time():.1f}"]
         command = [sys.executable, "-u", __file__, "train", *words]
         children[count] = subprocess.Popen(command)
     for count, child in children.items():
@@ -85,7 +91,6 @@ class Rooms:
         self.views, self.slots, self.device = int(arrays.pop("views")), slots, device
         height, width = arrays.pop("size").tolist()
         self.image_size = (int(height), int(width))
-        arrays.pop("classes")
         arrays |= {
             name: arrays[name].float() for name in ("boxes", "intrinsics", "world_to_camera")
         }
@@ -131,8 +136,31 @@ class Rooms:
         return views
 
 
-def train(path: Path, out: Path, count: int, until: float, device: str, seed: int = 0) -> None:
-    """Train until a time, then write decoded rooms and figures."""
+def write_views(shards: Path, out: Path) -> None:
+    """Write views of the training rooms, as many of each room; rooms with fewer repeat some."""
+    data = ViewDataset(shards, "train", VIEWS)
+    arrays = {field.name: getattr(data.flat, field.name).numpy() for field in fields(FlatViews)}
+    rng, views, sightings = np.random.default_rng(0), [], []
+    objects, last = arrays["object_count"], len(arrays["visible"]) - 1
+    ends = [*arrays["first_view"][1:], len(arrays["world_to_camera"])]
+    for room, (first, end) in enumerate(zip(arrays["first_view"], ends, strict=True)):
+        order = np.concatenate([rng.permutation(end - first) for _ in range(VIEWS_KEPT)])
+        kept = np.sort(order[:VIEWS_KEPT])
+        views.append(first + kept)
+        slots = np.arange(objects[room])
+        at = arrays["first_sighting"][room] + kept[:, None] * len(slots) + slots
+        sightings.append(at.ravel())
+    of_view, of_sighting = np.concatenate(views), np.concatenate([*sightings, [last]])
+    arrays |= {name: arrays[name][of_view] for name in ("world_to_camera", "intrinsics")}
+    arrays |= {name: arrays[name][of_sighting] for name in ("boxes", "visible", "sides_clear")}
+    arrays["first_view"] = np.arange(len(objects)) * VIEWS_KEPT
+    arrays["first_sighting"] = np.cumsum(objects * VIEWS_KEPT) - objects * VIEWS_KEPT
+    np.savez_compressed(out, **arrays, views=VIEWS_KEPT, size=np.array(data._image_sizes[0]))
+
+
+def train(path: Path, out: Path, count: int, device: str, seconds: float, seed: int = 0) -> None:
+    """Train for a time, then write decoded rooms and figures."""
+    until = time.time() + seconds
     small = SMALL if device == "cpu" else ()
     batch = 16 if small else BATCH
     torch.set_float32_matmul_precision("high")
@@ -213,8 +241,10 @@ def write_rooms(
     pick = torch.randperm(count, generator=generator)[:1000]
     known, anywhere = prior.latent_space(logits), prior.latent_space(drawn)
     trained = known[pick.to(logits.device)]
+    between = nn.functional.normalize(trained + trained.roll(1, dims=0), dim=1)
+    between = between * trained.norm(dim=1, keepdim=True)
     found: dict[str, Any] = {"pick": rooms.used[pick.numpy()], "history": np.array(history)}
-    for name, z in (("any", anywhere), ("train", trained)):
+    for name, z in zip(DECODED, (anywhere, between, trained), strict=True):
         parts = [prior.layouts(some, prior.max_objects)[0] for some in z.split(128)]
         logits_of = torch.cat([part.class_logits for part in parts])
         stop = torch.cat([part.completeness_logits for part in parts])
@@ -247,11 +277,12 @@ def _kl(real: np.ndarray, found: np.ndarray) -> float:
     return float((p * (np.log(p + 1e-6) - np.log(q + 1e-6))).sum())
 
 
-def evaluate(homes: Path, files: Sequence[Path]) -> None:
-    """Compare decoded rooms with made homes: layout classifier, gaps and category KL."""
-    from sceneprior.core.ground_truth import independent_rooms, shuffled_rooms
+def evaluate(shards: Path, files: Sequence[Path]) -> None:
+    """Compare decoded rooms with those of shards: layout classifier, gaps and category KL."""
+    from sceneprior.core.ground_truth import independent_rooms, reference_scenes, shuffled_rooms
 
-    real = made_rooms(homes)
+    splits = ("train", "val", "test")
+    real = {split: reference_scenes(shards, split, meshes=False) for split in splits}
     print({split: len(scenes) for split, scenes in real.items()}, flush=True)
     train = real["train"]
     few = min(1000, len(train))
@@ -261,7 +292,7 @@ def evaluate(homes: Path, files: Sequence[Path]) -> None:
     }  # fmt: skip
     for file in files:
         with np.load(file) as data:
-            sets |= {f"{file.stem}, {n}": decoded_rooms(data, n) for n in ("any", "train")}
+            sets |= {f"{file.stem}, {n}": decoded_rooms(data, n) for n in DECODED}
     for name, scenes in sets.items():
         try:
             print(name, scores(scenes, real), flush=True)
@@ -304,48 +335,26 @@ def decoded_rooms(data: Any, name: str) -> list[Scene]:
     ]
 
 
-def made_rooms(homes: Path) -> dict[str, list[Scene]]:
-    """The true rooms of made homes, by split."""
-    from data_prep.engine.plan import read_splits
-    from data_prep.front.furnished import ModelBank
-    from data_prep.front.houses import house_files, parse_house, read_house
-    from data_prep.front.recipe import broken_rule, load_recipe
-
-    recipe, bank = load_recipe("bedroom"), ModelBank(homes / "3D-FUTURE-model")
-    split_of = read_splits(homes / "splits" / "bedroom.csv")
-    real: dict[str, list[Scene]] = {"train": [], "val": [], "test": []}
-    for path in house_files(homes / "3D-FRONT"):
-        for room in read_house(parse_house(path), bank, recipe).rooms:
-            if broken_rule(room, recipe) is None and room.room_id in split_of:
-                real[split_of[room.room_id]].append(true_scene(room))
-    return real
-
-
-def true_scene(room: Any) -> Scene:
-    """A room of the reader as labelled boxes, without void."""
-    objects = []
-    for piece in room.furniture:
-        if piece.label != "void":
-            low, high = piece.mesh.vertices_m.min(axis=0), piece.mesh.vertices_m.max(axis=0)
-            objects.append(SceneObject(piece.label, tuple((low + high) / 2), tuple(high - low)))
-    return Scene(room.room_id, LABELS, tuple(objects))
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parts = parser.add_subparsers(dest="part", required=True)
-    trained = parts.add_parser("train")
-    for name, kind in (("flat", Path), ("out", Path), ("rooms", int), ("until", float)):
+    viewed, trained, evaluated = map(parts.add_parser, ("views", "train", "evaluate"))
+    viewed.add_argument("shards", type=Path)
+    viewed.add_argument("flat", type=Path)
+    for name, kind in (("flat", Path), ("out", Path), ("rooms", int)):
         trained.add_argument(name, type=kind)
     trained.add_argument("device", choices=("cuda", "cpu"))
-    evaluated = parts.add_parser("evaluate")
-    evaluated.add_argument("homes", type=Path)
+    trained.add_argument("--seconds", type=float, default=480.0)
+    trained.add_argument("--seed", type=int, default=0)
+    evaluated.add_argument("shards", type=Path)
     evaluated.add_argument("files", nargs="+", type=Path)
-    options = parser.parse_args()
-    if options.part == "train":
-        train(options.flat, options.out, options.rooms, options.until, options.device)
+    o = parser.parse_args()
+    if o.part == "views":
+        write_views(o.shards, o.flat)
+    elif o.part == "train":
+        train(o.flat, o.out, o.rooms, o.device, o.seconds, o.seed)
     else:
-        evaluate(options.homes, options.files)
+        evaluate(o.shards, o.files)
 
 
 if __name__ == "__main__":

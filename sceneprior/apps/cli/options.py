@@ -53,7 +53,9 @@ Shell = Annotated[
 Inception = Annotated[
     Path | None, option("The file inception-2015-12-05.pt (TorchScript), for FID.")
 ]
-Accelerator = Annotated[str, option("Device to train on: cpu, gpu or auto (Lightning).")]
+Accelerator = Annotated[
+    str | None, option("Device to train on: cpu, gpu or auto (default: that of the config).")
+]
 
 
 def _is_folder(scenes: Path | None) -> Path | None:

@@ -37,7 +37,7 @@ def fit(
     devices: Annotated[
         str | None, option("Number or list of devices; short for --set trainer.devices=...")
     ] = None,
-    accelerator: Annotated[str | None, option("Device to train on: cpu, gpu or auto.")] = None,
+    accelerator: options.Accelerator = None,
     precision: Annotated[str | None, option("32-true (default) or bf16-mixed.")] = None,
 ) -> None:
     """Train the stages of a run, one after the other."""
@@ -108,7 +108,7 @@ def compare(
     rooms: Annotated[str | None, option("Kinds of rooms, such as bedroom.")] = None,
     seeds: Annotated[str | None, option("Seeds, such as 0,1 (default: all).")] = None,
     inception: options.Inception = None,
-    accelerator: options.Accelerator = "auto",
+    accelerator: options.Accelerator = None,
 ) -> None:
     """Tabulate methods: train and evaluate those of a config, or evaluate SOURCES as they are.
 

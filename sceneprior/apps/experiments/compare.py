@@ -76,7 +76,7 @@ def compare(
     out: Path,
     main: Main,
     inception: Path | None = None,
-    accelerator: str = "auto",
+    accelerator: str | None = None,
 ) -> Compared:
     """Finish the runs of `part` (those of `runs_of`), then write the tables of all finished runs.
 
@@ -85,7 +85,8 @@ def compare(
 
     Args:
         inception: NVIDIA's `inception-2015-12-05.pt`; None leaves FID out.
-        accelerator: Lightning's name of the accelerator; each run is trained on one device.
+        accelerator: Lightning's name of the accelerator, instead of that of the configs; each run
+            is trained on one device.
     """
     if inception is not None:
         check_inception(inception)
@@ -147,7 +148,7 @@ def keeps_settings(run: Run) -> bool:
 
 
 def commands_of(
-    comparison: Comparison, run: Run, shared: list[str], accelerator: str = "auto"
+    comparison: Comparison, run: Run, shared: list[str], accelerator: str | None = None
 ) -> list[Command]:
     """The commands of a run: `fit`, and for each of its variants the one that scores it, which
     depends on `shared` (`shared_options`)."""
@@ -155,7 +156,8 @@ def commands_of(
     settings = [word for setting in run.settings for word in ("--set", setting)]
     words = ["fit", "--config", run.config, "--run", str(folder), *settings, "--logger", "csv"]
     # One device, because several would split each batch, or train on larger batches.
-    words += ["--accelerator", accelerator, "--devices", "1", "--resume"]
+    words += ["--accelerator", accelerator] if accelerator else []
+    words += ["--devices", "1", "--resume"]
     result = folder / run.run_config.stage_names[-1] / "final.ckpt"
     # It depends on nothing, because changed settings never repeat it: `keeps_settings` refuses.
     commands = [Command("fit", words, result, depends_on=[], continues=folder / "config.yaml")]
