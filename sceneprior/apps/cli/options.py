@@ -53,9 +53,7 @@ Shell = Annotated[
 Inception = Annotated[
     Path | None, option("The file inception-2015-12-05.pt (TorchScript), for FID.")
 ]
-Accelerator = Annotated[
-    str | None, option("Device to train on: cpu, gpu or auto (default: that of the config).")
-]
+Accelerator = Annotated[str | None, option("Device: cpu, gpu or auto (default: the config's).")]
 
 
 def _is_folder(scenes: Path | None) -> Path | None:

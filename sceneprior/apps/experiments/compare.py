@@ -66,8 +66,7 @@ class Compared(NamedTuple):
     failures: list[str]
     """A sentence for each run that failed; the table is written without it."""
     left_out: list[str]
-    """Titles of runs that were trained or evaluated with other settings than the runs in the
-    table."""
+    """Titles of runs that were trained or evaluated with other settings than those in the table."""
 
 
 def compare(
@@ -85,8 +84,7 @@ def compare(
 
     Args:
         inception: NVIDIA's `inception-2015-12-05.pt`; None leaves FID out.
-        accelerator: Lightning's name of the accelerator, instead of that of the configs; each run
-            is trained on one device.
+        accelerator: Lightning's name for it (default: the config's); each run uses one device.
     """
     if inception is not None:
         check_inception(inception)
@@ -156,8 +154,8 @@ def commands_of(
     settings = [word for setting in run.settings for word in ("--set", setting)]
     words = ["fit", "--config", run.config, "--run", str(folder), *settings, "--logger", "csv"]
     # One device, because several would split each batch, or train on larger batches.
-    words += ["--accelerator", accelerator] if accelerator else []
-    words += ["--devices", "1", "--resume"]
+    device = ["--accelerator", accelerator] if accelerator else []
+    words += [*device, "--devices", "1", "--resume"]
     result = folder / run.run_config.stage_names[-1] / "final.ckpt"
     # It depends on nothing, because changed settings never repeat it: `keeps_settings` refuses.
     commands = [Command("fit", words, result, depends_on=[], continues=folder / "config.yaml")]

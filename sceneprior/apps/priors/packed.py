@@ -247,7 +247,7 @@ def priors_that_draw(label: str) -> list[str]:
     """The shipped priors whose samplers draw a class.
 
     >>> priors_that_draw("wardrobe")
-    ['bedroom', 'demo-bedroom', 'living']
+    ['bedroom', 'demo-bedroom']
     """
     shipped = shipped_priors().items()
     return [name for name, path in shipped if label in drawn_classes(read_packed(path))]
