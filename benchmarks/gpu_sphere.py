@@ -20,7 +20,6 @@ import math
 import subprocess
 import sys
 import time
-import traceback
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -47,7 +46,9 @@ if TYPE_CHECKING:
 
 LABELS = "front3d_bedroom"
 FEW_ROOMS = 534
-VIEWS_KEPT, VIEWS, BATCH, SHOWN_S, WRITES_S = 24, 20, 128, 12.0, 12.0
+VIEWS_KEPT, VIEWS, BATCH, SHOWN_S = 24, 20, 128, 12.0
+AROUND_S = 20.0
+"""Seconds before and after a training, for imports and for writing rooms."""
 RATE, LATENT_RATE, CLIP = 3e-4, 1e-4, 1.0
 DECODED = ("any", "between", "train")
 """Rooms from N(0, 1), half-way between two training rooms, and training rooms."""
@@ -63,7 +64,7 @@ def sphere(setup: "Setup") -> None:
     began = time.perf_counter()
     with np.load(setup.flat) as data:
         rooms = len(data["object_count"])
-    until = setup.until - WRITES_S
+    until = setup.until - AROUND_S
     if setup.device == "cpu":
         until = min(until, time.time() + 60)
     children = {}
@@ -91,10 +92,9 @@ class Rooms:
         self.views, self.slots, self.device = int(arrays.pop("views")), slots, device
         height, width = arrays.pop("size").tolist()
         self.image_size = (int(height), int(width))
-        arrays |= {
-            name: arrays[name].float() for name in ("boxes", "intrinsics", "world_to_camera")
-        }
-        flat = FlatViews(**arrays)
+        for name in ("boxes", "intrinsics", "world_to_camera"):
+            arrays[name] = arrays[name].float()
+        flat = FlatViews(**{field.name: arrays[field.name] for field in fields(FlatViews)})
         every = len(flat.object_count)
         self.used = np.sort(np.random.default_rng([seed, 5]).permutation(every)[:count])
         self.counts = flat.object_count.numpy()[self.used]
@@ -294,10 +294,7 @@ def evaluate(shards: Path, files: Sequence[Path]) -> None:
         with np.load(file) as data:
             sets |= {f"{file.stem}, {n}": decoded_rooms(data, n) for n in DECODED}
     for name, scenes in sets.items():
-        try:
-            print(name, scores(scenes, real), flush=True)
-        except Exception:
-            print(name, traceback.format_exc(), flush=True)
+        print(name, scores(scenes, real), flush=True)
 
 
 def scores(scenes: Sequence[Scene], real: dict[str, list[Scene]]) -> str:
