@@ -193,12 +193,12 @@ def floor_beside(bed: Piece, side: float, depth_m: float) -> shapely.Polygon:
 
 
 def pairs_at_bed(pieces: Sequence[Piece]) -> list[Finding]:
-    """Outcome for the only bed and its two nightstands: they flank one of its ends."""
+    """Outcome for the only bed and its two nightstands: they flank an end that may be its head."""
     beds, stands = rows_of(pieces, BEDS), rows_of(pieces, NIGHTSTANDS)
     if len(beds) != 1 or len(stands) != 2:
         return []
-    one, other = (end_of_bed(pieces[beds[0]], pieces[row]) for row in stands)
-    holds = one is not None and other is not None and one[0] == other[0] and one[1] != other[1]
+    places = {end_of_bed(pieces[beds[0]], pieces[row]) for row in stands}
+    holds = any(places == {(end, -1.0), (end, 1.0)} for end in heads(pieces[beds[0]]))
     return [Finding((*beds, *stands), holds)]
 
 
