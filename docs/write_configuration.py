@@ -22,10 +22,11 @@ LINE = 110
 HEAD = f"""# All settings
 
 The keys of a run's YAML, by method and section: type and range, the default (a key without one
-must be given), the value of `configs/{PAPER}` (paper), and the effect. A key is described once;
-keys that a section shares with an earlier one, with the same default, are only named. On the
-command line, `--set layout.epochs=10` changes a key. [Which config to take](../configs/README.md)
-is another page.
+must be given), the value in `configs/{PAPER}` (bedroom.yaml), and the effect. That file has the
+paper's settings where the paper gives them ([key by key](paper_map.md#the-settings-key-by-key)). A
+key is described once; keys that a section shares with an earlier one, with the same default, are
+only named. On the command line, `--set layout.epochs=10` changes a key. [Which config to
+take](../configs/README.md) is another page.
 
 <!-- Written by docs/write_configuration.py from the docstrings of the settings; change those. -->
 """
@@ -102,9 +103,13 @@ def entry(key: Key, paper: Any) -> str:
     ]
     said = [" ".join([type_of(field.annotation), ", ".join(bounds)]).strip()]
     said += [] if field.is_required() else [f"default {shown(key.default)}"]
+    variant = key.section.model_fields.get("name")
     for part in key.path:
-        paper = paper.get(part) if isinstance(paper, dict) else None
-    said += [] if paper is None else [f"paper {shown(paper)}"]
+        same = isinstance(paper, dict) and (
+            variant is None or paper.get("name", variant.default) == variant.default
+        )
+        paper = paper.get(part) if same else None
+    said += [] if paper is None else [f"bedroom.yaml {shown(paper)}"]
     return wrapped(f"- **`{dotted}`** ({'; '.join(said)}): {text}")
 
 

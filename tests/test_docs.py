@@ -35,6 +35,7 @@ BASES = [
     ROOT / name for name in ("", "sceneprior", "docs", "configs", "benchmarks", "data_prep/engine")
 ]
 """Folders to which paths in pages are relative."""
+SHIPPED = {path.stem for path in (ROOT / "sceneprior/apps/priors").glob("*.prior")}
 MADE_BY_USERS = {"config.yaml", "hparams.yaml"}
 """Names of YAML files that are no part of the repository."""
 
@@ -62,6 +63,8 @@ def check_sceneprior(words: list[str], folder: Path) -> None:
         commands[words[1]].make_context(words[1], words[2:])
     except Exception as error:  # typer's usage errors, which are click's own or a copy of them
         pytest.fail(f"{shlex.join(words)}: {error}")
+    if words[1] in ("evaluate", "eval-fid", "eval-svr") and {*values_of("--run", words)} & SHIPPED:
+        assert "--out" in words, f"{shlex.join(words)}: a shipped prior has no folder for scores"
     for config in values_of("--config", words):
         written = folder / config
         source = str(written if written.is_file() else config)

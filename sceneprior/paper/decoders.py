@@ -242,7 +242,7 @@ class ShapeDecoderConfig(ShapeModuleConfig):
     """Template and size of the shape decoder."""
 
     width: int = Field(256, ge=8)
-    """Hidden width; the paper's network has 256. Wider ones deform in more detail, slower."""
+    """Hidden width; 256 in the released code. Wider ones deform in more detail, slower."""
     level: int = Field(4, ge=0, le=6)
     """Icosphere subdivisions of the template: 20 * 4**level faces. Each level has finer shapes, and
     four times the faces to render."""
