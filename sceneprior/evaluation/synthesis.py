@@ -257,7 +257,7 @@ def _draw_rooms(
     rows_of = {"test": range(len(groups["test"])), "train": rooms.train_rows}
 
     def reference(*given: Any) -> Features:
-        key = drawing, options, count, given[0]
+        key = drawing, options.split, options.seed, count, given[0]
         return kept(shards, key, lambda: drawing.features(*given))
 
     drawn = {

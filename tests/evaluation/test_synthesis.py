@@ -80,6 +80,10 @@ def test_real_and_random_rooms_are_drawn_and_measured_once(
     again, some = evaluated(generated)
     assert json.dumps(again) == json.dumps(first)
     assert some == ["drawing generated rooms", "measuring generated rooms"]
+    titles.clear()
+    evaluate_synthesis(generated, folder, replace(options, boxes=True))
+    boxed = [f"drawing boxed {name} rooms" for name in ("generated", "test", "train")]
+    assert titles == ["drawing generated rooms", *boxed]
     next((folder / "train").glob("*.h5")).touch()
     assert evaluated(generated)[1] == all_titles
 
