@@ -48,7 +48,7 @@ BUDGET = {
     "sceneprior/paper": (2771, 13),
     "sceneprior/lifted": (9092, 45),
     "sceneprior/baselines": (2926, 14),
-    "sceneprior/evaluation": (4469, 21),
+    "sceneprior/evaluation": (4474, 21),
     "sceneprior/interchange": (912, 5),
     "sceneprior/apps": (7388, 42),
 }

@@ -50,6 +50,8 @@ NOTE = (
 BASELINES = {"independent": independent_rooms, "shuffled": shuffled_rooms}
 """Functions that make the rooms of the baselines, which are drawn as boxes and with meshes."""
 
+MOST_KEPT = 60
+"""Number of results of reference rooms that are `kept`: about a dozen for a folder of shards."""
 _kept: dict[Hashable, Any] = {}
 _PACKAGES = (
     "sceneprior", "torch", "numpy", "scipy", "scikit-learn", "shapely", "trimesh", "numba",
@@ -258,7 +260,8 @@ def _draw_rooms(
 
     def reference(*given: Any) -> Features:
         key = drawing, options.split, options.seed, count, given[0]
-        return kept(shards, key, lambda: drawing.features(*given))
+        few = None if drawing.small else shards  # pictures for AlexNet are too large to keep
+        return kept(few, key, lambda: drawing.features(*given))
 
     drawn = {
         group: reference(split, stream_scenes, shards, split, rows_of[group])
@@ -287,10 +290,12 @@ def kept(shards: Path | None, key: Hashable, make: Callable[[], Any]) -> Any:
     the state of the files of shards; without shards, `make()`."""
     if shards is None:
         return make()
-    files = ((path, path.stat()) for path in sorted(Path(shards).rglob("*")))
+    files = ((path, path.stat()) for path in sorted(Path(shards).rglob("*")) if path.is_file())
     key = key, tuple((str(path), state.st_mtime_ns, state.st_size) for path, state in files)
     if key not in _kept:
         _kept[key] = make()
+        if len(_kept) > MOST_KEPT:
+            del _kept[next(iter(_kept))]
     return _kept[key]
 
 

@@ -109,7 +109,7 @@ class ShapeConfig(StageConfig):
     """Softness of silhouettes in squared pixels; None uses the paper's 1e-4 squared NDC. Smaller is
     crisper, and pulls on fewer pixels."""
     silhouettes: Literal["exact", "fast"] = "exact"
-    """`exact`: every face near a pixel counts (the paper: 50); `fast`: the outline alone."""
+    """`exact`: every face near a pixel counts (paper: at most 50); `fast`: the outline alone."""
     compositing: Literal["layered", "paper"] = "paper"
     """Visible masks of overlapping objects. `paper`: the scene's coverage goes to the front-most
     object of each pixel; `layered`: a boundary between two objects also moves the one in front."""

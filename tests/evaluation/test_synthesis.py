@@ -10,7 +10,7 @@ from toy_metrics import without_classifiers
 from sceneprior.core.ground_truth import reference_scenes
 from sceneprior.core.parallel import run_tasks
 from sceneprior.core.scene import Scene, SceneObject
-from sceneprior.evaluation import features, use
+from sceneprior.evaluation import features, synthesis, use
 from sceneprior.evaluation.score_table import headings, print_scores, score_rows
 from sceneprior.evaluation.synthesis import EvalOptions, evaluate_synthesis
 from sceneprior.evaluation.use import UseOptions, evaluate_use
@@ -84,6 +84,10 @@ def test_real_and_random_rooms_are_drawn_and_measured_once(
     evaluate_synthesis(generated, folder, replace(options, boxes=True))
     boxed = [f"drawing boxed {name} rooms" for name in ("generated", "test", "train")]
     assert titles == ["drawing generated rooms", *boxed]
+    options = EvalOptions(seed=1, resamples=5)
+    warm, _ = evaluated(generated)
+    synthesis._kept.clear()
+    assert json.dumps(evaluated(generated)[0]) == json.dumps(warm)
     next((folder / "train").glob("*.h5")).touch()
     assert evaluated(generated)[1] == all_titles
 
