@@ -23,7 +23,7 @@ from PIL import Image
 from trimesh.voxel.encoding import DenseEncoding
 from trimesh.voxel.morphology import fill_orthographic
 
-from sceneprior.apps.config import load_run
+from sceneprior.apps.api import load
 from sceneprior.apps.experiments.evaluate import decoded_and_true
 from sceneprior.core.boxes import match_scenes
 from sceneprior.core.proxies import icosphere
@@ -178,12 +178,12 @@ def main() -> None:
     options.add_argument("--json", type=Path, help="file for five of the numbers")
     options.add_argument("--sheet", type=Path, help="file for a picture of 24 rooms (PNG)")
     given = options.parse_args()
-    trained = load_run(given.run)
+    trained = load(given.run).with_latents
     shards = Path(trained.config.data.shards)
     shaped = layout = decoded_and_true(trained, shards, meshes=True)
     if "layout" in trained.config.stage_names:
         boxes = trained.config.load("layout", given.run / "layout" / "final.ckpt")
-        assert isinstance(boxes, TrainedPrior), "load_run refuses runs without latents"
+        assert isinstance(boxes, TrainedPrior), "the run has latents, as above"
         layout = decoded_and_true(boxes, shards, meshes=True)
     order = np.random.default_rng(0).permutation(len(shaped))[: given.rooms]
     flat, full = ([pairs[row] for row in order] for pairs in (layout, shaped))

@@ -117,9 +117,9 @@ def toy_run(toy_shards: Path, made_once: Callable[..., Path]) -> Path:
 @pytest.fixture(scope="session")
 def trained(toy_run: Path):
     """The toy run, ready for use. Tests change nothing of it."""
-    from sceneprior.apps.config import load_run
+    from sceneprior.apps.api import load
 
-    return load_run(toy_run)
+    return load(toy_run).with_latents
 
 
 @pytest.fixture(scope="session")

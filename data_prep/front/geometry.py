@@ -8,6 +8,7 @@ import numpy as np
 import shapely
 import shapely.affinity
 
+from sceneprior.core.cameras import rigid
 from sceneprior.core.errors import InputError
 
 FAR_M = 1e5
@@ -65,10 +66,7 @@ def placement_of(
             [s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y)],
         ]
     )
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation * scale
-    matrix[:3, 3] = place
-    return matrix, scale
+    return rigid(rotation * scale, place), scale
 
 
 def surface_of(mesh: dict[str, Any], child: dict[str, Any]) -> tuple[np.ndarray, int]:

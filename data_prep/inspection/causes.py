@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from data_prep.inspection.agreement import Room, compare, score
-from sceneprior.core.cameras import camera_centers, pixel_rays
+from sceneprior.core.cameras import camera_centers, pixel_rays, rigid
 from sceneprior.core.checked import number_array
 
 FOCAL_STEPS = tuple(k for k in range(-8, 9) if k)
@@ -133,7 +133,7 @@ def _poses(room: Room, convention: Convention) -> Corrected:
     """World-to-camera matrices under each hypothesis on what the written matrices hold."""
     world = convention.room_from_world
     of_world = np.linalg.inv(world) @ np.linalg.inv(room.views.world_to_camera)
-    written = of_world @ np.linalg.inv(_square(convention.axes))
+    written = of_world @ np.linalg.inv(rigid(convention.axes))
     if convention.reading == W2C:
         written = np.linalg.inv(written)
     turned, moved = written.copy(), written.copy()
@@ -144,17 +144,11 @@ def _poses(room: Room, convention: Convention) -> Corrected:
     rare = [(convention.reading, axes) for axes in _EVERY_AXES if axes not in (OPENGL, OPENCV)]
     for reading, axes in usual + rare:
         if (reading, axes) != (convention.reading, convention.axes):
-            camera_to_world = contents[reading] @ _square(axes)
+            camera_to_world = contents[reading] @ rigid(axes)
             # A mirrored world can be rotated until the room's z is the mirrored axis.
-            mirror = np.diag([1.0, 1, np.linalg.det(_square(axes)), 1])
+            mirror = np.diag([1.0, 1, np.linalg.det(rigid(axes)), 1])
             in_room = np.linalg.inv(mirror @ world @ camera_to_world)
             yield Cause("poses", (reading, axes)), room.seen_by(in_room)
-
-
-def _square(axes: Axes) -> np.ndarray:
-    matrix = np.eye(4)
-    matrix[:3, :3] = axes
-    return matrix
 
 
 def _wrong_poses(held: tuple[str, Axes], convention: Convention) -> str:

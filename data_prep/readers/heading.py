@@ -14,6 +14,7 @@ from jaxtyping import Float, Int, Integer
 from scipy import ndimage
 
 from sceneprior.core.boxes import yaw_rotation
+from sceneprior.core.cameras import rigid
 from sceneprior.core.observations import RoomViews, stuff_step, thinned, thinned_intrinsics
 
 ALIGNED_DEG = 1.0
@@ -84,9 +85,7 @@ def find_turn(views: RoomViews) -> float | None:
 
 def turn_matrix(degrees: float) -> Float[np.ndarray, "4 4"]:
     """Rigid transform that turns a world about +y."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = yaw_rotation(np.radians(degrees))
-    return matrix
+    return rigid(yaw_rotation(np.radians(degrees)))
 
 
 def note_of_turn(degrees: float | None) -> list[str]:

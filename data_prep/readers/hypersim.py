@@ -26,6 +26,7 @@ from data_prep.readers.annotations import ids_and_classes, read_hdf5, read_recor
 from data_prep.readers.frames import GL_TO_CV, Y_UP, choose_frames, sampled
 from data_prep.readers.reader import FoundRoom, Reader
 from data_prep.readers.rooms import FramedRoom, corners_of, numbered
+from sceneprior.core.cameras import rigid
 from sceneprior.core.checked import plain
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import list_folders
@@ -144,9 +145,7 @@ def _trajectories(scene: Path, unit: float) -> tuple[list[tuple[Path, Path]], np
                 f"{folder}: camera_keyframe_positions have the shape {positions.shape} and "
                 f"orientations {turns.shape}, expected (n, 3) and (n, 3, 3); {_HINT}."
             )
-        cameras = np.tile(np.eye(4), (count, 1, 1))
-        cameras[:, :3, :3], cameras[:, :3, 3] = turns, positions * unit
-        poses.append(cameras)
+        poses.append(rigid(turns, positions * unit))
         pictures = scene / "images" / f"scene_{folder.name}_geometry_hdf5"
         for k in range(count):
             start = pictures / f"frame.{k:04d}"

@@ -13,7 +13,7 @@ from data_prep.readers.frames import room_cameras
 from data_prep.readers.heading import find_turn, note_of_turn, turn_matrix
 from data_prep.readers.upright import find_floor, fit_upright
 from sceneprior.core.boxes import CUBE_CORNERS
-from sceneprior.core.cameras import to_camera, to_pixels
+from sceneprior.core.cameras import rigid, to_camera, to_pixels
 from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.errors import InputError
 from sceneprior.core.id_tables import IdTable, tidy
@@ -179,9 +179,7 @@ def prepare_room(task: RoomTask, room: FramedRoom) -> PreparedRoom | Line:
     ceiling_y = room.ceiling_y
     if ceiling_y is None:
         ceiling_y = max(room.camera_to_world[:, 1, 3].max(), room.top_y)
-    to_origin = np.eye(4)
-    to_origin[:3, 3] = -origin
-    room = replace(room, floor_m=outline).moved(to_origin)
+    room = replace(room, floor_m=outline).moved(rigid(np.eye(3), -origin))
     cameras = room_cameras(room.camera_to_world)
     views = seen.room_views(room_id, cameras, room.intrinsics, room.stuff)
     if degrees:

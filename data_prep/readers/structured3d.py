@@ -26,7 +26,7 @@ from data_prep.readers.annotations import ids_and_classes
 from data_prep.readers.frames import Y_UP, choose_frames, sampled
 from data_prep.readers.reader import FoundRoom, Reader, by_number
 from data_prep.readers.rooms import FramedRoom, corners_of, numbered
-from sceneprior.core.cameras import odd_field_of_view
+from sceneprior.core.cameras import odd_field_of_view, rigid
 from sceneprior.core.checked import checked, shown
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import list_folders, read_json, read_text
@@ -161,10 +161,8 @@ def _read_camera(path: Path) -> tuple[np.ndarray, np.ndarray]:
             "are those of no camera; download the scene again."
         )
     ahead, right = ahead / np.linalg.norm(ahead), right / np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(ahead, right), ahead], axis=1)
-    pose[:3, 3] = eye * _METRES
-    return pose, angles
+    turn = np.stack([right, np.cross(ahead, right), ahead], axis=1)
+    return rigid(turn, eye * _METRES), angles
 
 
 def _read_boxes(path: Path) -> dict[int, np.ndarray]:

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sceneprior import __version__
-from sceneprior.apps.config import load_any_run, weights_of, with_latents
+from sceneprior.apps.config import load_any_run, weights_of
 from sceneprior.apps.priors.packed import name_of, version_of
 from sceneprior.apps.sample import Then, request_of, sample_rooms
 from sceneprior.core.classes import label_set
@@ -21,7 +21,7 @@ from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.views import DecodedScenes, ObservedImage
 from sceneprior.paper.prior import TrainedPrior
 from sceneprior.paper.sampling import BATCH, Point, latent_of
-from sceneprior.training.method import Trained
+from sceneprior.training.method import Trained, TrainedReconstructor
 
 if TYPE_CHECKING:
     from sceneprior.apps.reconstruction.reconstruct import Reconstruction
@@ -299,8 +299,17 @@ class Prior:
 
     @property
     def with_latents(self) -> TrainedPrior:
-        """Return `trained`; raise InputError if it has no latent space."""
-        return with_latents(self.trained, self.where)
+        """Return `trained`; raise InputError if, as those of baselines, it has no latent space."""
+        if isinstance(self.trained, TrainedPrior):
+            return self.trained
+        works = "synthesize`, `eval-fid` and `report"
+        if isinstance(self.trained, TrainedReconstructor):
+            works = "reconstruct` and `eval-svr"
+        raise InputError(
+            f"{self.where} is a run of `method: {self.trained.config.method}`, which has no latent "
+            "space of rooms, and this command needs one. Use a run of `method: paper` or `lifted`; "
+            f"this run works with `sceneprior {works}`."
+        )
 
 
 def _draw(

@@ -12,14 +12,7 @@ from typing import Any
 from sceneprior.apps.priors.packed import find_prior, is_packed, read_packed, unpack
 from sceneprior.core.errors import ConfigError, InputError, shortened
 from sceneprior.core.settings import check_settings, read_settings
-from sceneprior.paper.prior import TrainedPrior
-from sceneprior.training.method import (
-    RunConfig,
-    Trained,
-    TrainedReconstructor,
-    find_checkpoint,
-    without_samples,
-)
+from sceneprior.training.method import RunConfig, Trained, find_checkpoint, without_samples
 
 METHODS = {
     "paper": "sceneprior.paper.config:PaperConfig",
@@ -85,25 +78,6 @@ def load_any_run(run: Path | str) -> Trained:
         return unpack(packed, check_config(packed.said.settings, str(run)), str(run))
     config = run_config(path)
     return config.load(*find_checkpoint(path, config.stage_names))
-
-
-def load_run(run: Path | str) -> TrainedPrior:
-    """The trained prior of a run, in evaluation mode: for tasks that need its latent space."""
-    return with_latents(load_any_run(run), run)
-
-
-def with_latents(trained: Trained, run: Path | str) -> TrainedPrior:
-    """Return `trained` if it has a latent space; otherwise, as for baselines, raise InputError."""
-    if not isinstance(trained, TrainedPrior):
-        works = "synthesize`, `eval-fid` and `report"
-        if isinstance(trained, TrainedReconstructor):
-            works = "reconstruct` and `eval-svr"
-        raise InputError(
-            f"{run} is a run of `method: {trained.config.method}`, which has no latent space of "
-            "rooms, and this command needs one. Use a run of `method: paper` or `lifted`; this run "
-            f"works with `sceneprior {works}`."
-        )
-    return trained
 
 
 def run_config(run: Path | str) -> RunConfig:

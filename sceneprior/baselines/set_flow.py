@@ -13,7 +13,7 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from sceneprior.baselines.atiss import OCTAVES, SetModel, fourier_features
+from sceneprior.baselines.atiss import BATCH, OCTAVES, SetModel, fourier_features
 from sceneprior.baselines.one_stage import BoxConfig, OneStage, OneStageTraining, room_means
 from sceneprior.core.mixtures import draw_index
 from sceneprior.core.views import RoomBoxes
@@ -30,8 +30,6 @@ WAVE = 4.0
 """Half the period of the slowest Fourier feature, in standard deviations of a value."""
 LEAST_SPREAD = 1e-3
 """Minimum standard deviation by which values are divided."""
-BATCH = 256
-"""Rooms per batch in sampling."""
 
 
 class SetFlowModel(SetModel):
@@ -68,7 +66,7 @@ class SetFlow(nn.Module):
         self.object = nn.Linear(token + NUMBERS * 2 * OCTAVES, width)
         self.time = mlp(nn.Linear(2 * OCTAVES, width), nn.Linear(width, width))
         self.blocks = nn.ModuleList(
-            Block(width, config.heads, config.hidden) for _ in range(config.layers)
+            Block(width, config.heads, config.hidden, config.dropout) for _ in range(config.layers)
         )
         self.out = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, token))
 
@@ -161,11 +159,11 @@ class SetFlow(nn.Module):
 
 class Block(nn.Module):
     """Attention among the objects of each room, then a feed-forward layer, each after a layer
-    norm."""
+    norm and with dropout."""
 
-    def __init__(self, width: int, heads: int, hidden: int):
+    def __init__(self, width: int, heads: int, hidden: int, dropout: float):
         super().__init__()
-        self.heads = heads
+        self.heads, self.drop = heads, nn.Dropout(dropout)
         self.before_attention, self.before_mlp = nn.LayerNorm(width), nn.LayerNorm(width)
         self.queries_keys_values = nn.Linear(width, 3 * width)
         self.mix = nn.Linear(width, width)
@@ -178,8 +176,8 @@ class Block(nn.Module):
         projected = _padded(self.queries_keys_values(self.before_attention(hidden)), is_object)
         query, key, value = projected.unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
         seen = F.scaled_dot_product_attention(query, key, value, is_object[:, None, None])
-        hidden = hidden + self.mix(seen.transpose(1, 2).flatten(-2)[is_object])
-        return hidden + self.mlp(self.before_mlp(hidden))
+        hidden = hidden + self.drop(self.mix(seen.transpose(1, 2).flatten(-2)[is_object]))
+        return hidden + self.drop(self.mlp(self.before_mlp(hidden)))
 
 
 def _padded(

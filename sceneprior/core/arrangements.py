@@ -267,16 +267,11 @@ def fronts(pieces: Sequence[Piece], floor: shapely.Geometry) -> dict[str, list[F
         if piece.front is None or not piece.standing:
             continue
         others = [other for other in pieces if other is not piece and other.standing]
-        free.append(Finding((row,), has_free_front(piece, others, floor)))
+        blocking = [other for other in others if other.label not in (*CHAIRS, "stool")]
+        free.append(Finding((row,), is_free(piece.before(BEFORE_M), blocking, floor)))
         walls = [floor.boundary, *(other.place for other in others)]
         backed.append(Finding((row,), piece.back_gap_m(walls) <= BACK_M))
     return {"fronts_free": free, "backs_covered": backed}
-
-
-def has_free_front(piece: Piece, others: Sequence[Piece], floor: shapely.Geometry) -> bool:
-    """True if the floor before a piece is free (`is_free`) of all but chairs."""
-    blocking = [other for other in others if other.label not in (*CHAIRS, "stool")]
-    return is_free(piece.before(BEFORE_M), blocking, floor)
 
 
 def is_free(place: shapely.Polygon, others: Iterable[Piece], floor: shapely.Geometry) -> bool:

@@ -124,18 +124,6 @@ CENTER_WEIGHT = 0.01
 negligible against differences in IoU."""
 
 
-def intersection_volumes(
-    centers_a: Float[np.ndarray, "n 3"],
-    sizes_a: Float[np.ndarray, "n 3"],
-    centers_b: Float[np.ndarray, "m 3"],
-    sizes_b: Float[np.ndarray, "m 3"],
-) -> Float[np.ndarray, "n m"]:
-    """Intersection volume of every axis-aligned box a with every box b, in cubic metres."""
-    low = np.maximum((centers_a - sizes_a / 2)[:, None], (centers_b - sizes_b / 2)[None])
-    high = np.minimum((centers_a + sizes_a / 2)[:, None], (centers_b + sizes_b / 2)[None])
-    return np.asarray(np.clip(high - low, 0, None).prod(2))
-
-
 def box_iou_3d(
     centers_a: Float[np.ndarray, "n 3"],
     sizes_a: Float[np.ndarray, "n 3"],
@@ -153,7 +141,9 @@ def box_iou_3d(
         >>> round(float(iou[0, 0]), 6)
         0.333333
     """
-    shared = intersection_volumes(centers_a, sizes_a, centers_b, sizes_b)
+    low = np.maximum((centers_a - sizes_a / 2)[:, None], (centers_b - sizes_b / 2)[None])
+    high = np.minimum((centers_a + sizes_a / 2)[:, None], (centers_b + sizes_b / 2)[None])
+    shared = np.asarray(np.clip(high - low, 0, None).prod(2))
     union = sizes_a.prod(1)[:, None] + sizes_b.prod(1)[None] - shared
     return np.divide(shared, union, out=np.zeros_like(shared), where=union > 0)
 

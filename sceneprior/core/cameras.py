@@ -57,14 +57,19 @@ def camera_centers(world_to_camera: Float[Array, "*batch 4 4"]) -> Float[Array, 
     return -(rotation.mT @ translation)[..., 0]
 
 
+def rigid(rotation: Any, place: Any = 0.0) -> np.ndarray:
+    """The matrix, (..., 4, 4), that applies `rotation` (..., 3, 3) and then adds `place`."""
+    matrix = np.tile(np.eye(4), (*np.shape(rotation)[:-2], 1, 1))
+    matrix[..., :3, :3], matrix[..., :3, 3] = rotation, place
+    return matrix
+
+
 def camera_at(
     rotation: Float[np.ndarray, "*batch 3 3"], eye_m: Float[np.ndarray, "*batch 3"]
 ) -> Float[np.ndarray, "*batch 4 4"]:
     """`world_to_camera` of cameras at `eye_m` whose axes (right, down, ahead) are the rows of
     `rotation`."""
-    matrix = np.tile(np.eye(4), (*eye_m.shape[:-1], 1, 1))
-    matrix[..., :3, :3], matrix[..., :3, 3] = rotation, -(rotation @ eye_m[..., None])[..., 0]
-    return matrix
+    return rigid(rotation, -(rotation @ eye_m[..., None])[..., 0])
 
 
 def look_at(

@@ -57,17 +57,13 @@ def stream_scenes(shards: Path, split: str, rows: Collection[int]) -> Iterator[S
             yield reference_scene(*room, shards)
 
 
-def independent_rooms(
-    real: Sequence[Scene], count: int, seed: int, with_meshes: bool = False
-) -> list[Scene]:
+def independent_rooms(real: Sequence[Scene], count: int, seed: int) -> list[Scene]:
     """Sample rooms from the marginals of real rooms: a baseline without object relations.
 
     A room has as many objects as a randomly chosen real room. Each object is drawn from the objects
-    of all real rooms, and keeps its class, box and position. So every single object is real, but
-    the objects of a room are independent of each other.
-
-    `with_meshes` keeps the real meshes, a stronger baseline; otherwise objects are boxes. Floor and
-    ceiling are those of the real room that determines the number of objects.
+    of all real rooms, and keeps its class, box, position and mesh, if it has one. So every single
+    object is real, but the objects of a room are independent of each other. Floor and ceiling are
+    those of the real room that determines the number of objects.
     """
     pool = [item for scene in real for item in scene.objects]
     if not pool:
@@ -77,7 +73,7 @@ def independent_rooms(
         )
     generator = np.random.default_rng(seed)
     chosen = [real[row] for row in generator.choice(len(real), size=count)]
-    rooms = [
+    return [
         Scene(
             f"independent_{index:04d}",
             real[0].label_set,
@@ -87,23 +83,19 @@ def independent_rooms(
         )
         for index, like in enumerate(chosen)
     ]
-    return rooms if with_meshes else [room.without_meshes() for room in rooms]
 
 
-def shuffled_rooms(
-    real: Sequence[Scene], count: int, seed: int, with_meshes: bool = False
-) -> list[Scene]:
+def shuffled_rooms(real: Sequence[Scene], count: int, seed: int) -> list[Scene]:
     """Real rooms with shuffled positions: a baseline with real contents but random layouts.
 
     Each object takes the x and z of an object drawn at random from all rooms, and keeps its own
     height; the room keeps its floor and ceiling. The rooms are drawn without replacement.
-    `with_meshes` keeps the real meshes; otherwise objects are boxes.
     """
     generator = np.random.default_rng(seed)
     places = [item.center_m for scene in real for item in scene.objects]
     rooms: list[Scene] = []
     for row in generator.permutation(len(real))[:count]:
-        like = real[row] if with_meshes else real[row].without_meshes()
+        like = real[row]
         chosen = generator.integers(len(places), size=len(like.objects))
         objects = []
         for item, pick in zip(like.objects, chosen, strict=True):

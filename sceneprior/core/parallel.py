@@ -202,7 +202,7 @@ def map_blocks(
     """Call `function(some, first)` in a task for every `size` items; `first` is the index of their
     first. Returns all results in one list."""
     tasks = {
-        f"items from {getattr(items[first], 'name', first)} on": (items[first:][:size], first)
+        f"items from number {first + 1} on": (items[first:][:size], first)
         for first in range(0, len(items), size)
     }
     return [each for part in run_tasks(function, tasks, title or None) for each in part]

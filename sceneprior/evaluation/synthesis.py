@@ -273,7 +273,7 @@ def _draw_rooms(
     # Rooms are read again with meshes, so that all training meshes are in memory only here.
     real = reference_scenes(shards, "train")
     for group, rooms_of in BASELINES.items():
-        furnished = rooms_of(real, count, options.seed, with_meshes=True)
+        furnished = rooms_of(real, count, options.seed)
         drawn[f"{group}_meshes"] = reference(f"{group}, furnished", list, furnished)
     del real, furnished
     for group in sorted(groups) if options.boxes else ():

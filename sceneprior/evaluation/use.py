@@ -131,8 +131,8 @@ def evaluate_use(
         train = reference_scenes(shards, "train")
         count = min(len(generated), len(train))
         sets["test"] = reference_scenes(shards, options.split)
-        sets["shuffled"] = shuffled_rooms(train, count, options.seed, with_meshes=True)
-        sets["independent"] = independent_rooms(train, count, options.seed, with_meshes=True)
+        sets["shuffled"] = shuffled_rooms(train, count, options.seed)
+        sets["independent"] = independent_rooms(train, count, options.seed)
         common_label_set(generated, sets["test"])
     columns, left_out = measure_use(sets, options.seed, options.resamples, use, shards)
     if scores is None:

@@ -160,6 +160,8 @@ def _label_names(
     if labels.dtype.kind not in "fiub" or labels.shape[1:] == (0,):
         raise InputError(f"{path}: class_labels are neither names, indices nor one-hot rows.")
     one_hot = labels.ndim == 2
+    if one_hot and not (labels.max(-1) > 0).all():
+        raise InputError(f"{path}: class_labels have rows without a 1; leave out such objects.")
     rows = labels.argmax(-1) if one_hot else labels.astype(int)
     wide = labels.shape[1] if one_hot else int(rows.max(initial=-1)) + 1
     if may_have_ends and one_hot and wide == len(columns) + 2:

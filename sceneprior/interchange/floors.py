@@ -161,15 +161,20 @@ def _front_floor(path: Path, house: dict[str, Any], room_id: str) -> np.ndarray:
         triangles = []
         for ref in refs:
             corners = np.array(meshes[ref]["xyz"], dtype=np.float64).reshape(-1, 3)[:, [0, 2]]
+            if not np.isfinite(corners).all():
+                raise ValueError("xyz of a floor is not finite")
             triangles += list(corners[np.array(meshes[ref]["faces"], dtype=int).reshape(-1, 3)])
+    except InputError:
+        raise
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise InputError(
             f"{path} is no house of 3D-FRONT ({type(error).__name__}: {error})."
         ) from None
     whole = shapely.union_all([shapely.Polygon(each).buffer(1e-3) for each in triangles])
-    if whole.is_empty:
+    largest = max(shapely.get_parts(whole), key=shapely.area, default=whole)
+    largest = largest.buffer(-1e-3, join_style="mitre")
+    if largest.is_empty:
         raise InputError(f"{path}: room {room_id or room['instanceid']} has no floor.")
-    largest = max(shapely.get_parts(whole), key=shapely.area).buffer(-1e-3, join_style="mitre")
     outline_m = _largest_outline(largest.simplify(FINEST_M))
     check_floor(path, outline_m)
     return outline_m

@@ -124,7 +124,7 @@ class LiftedConfig(PriorConfig):
     def trained(self, networks: nn.Module, stage: str, room_ids: tuple[str, ...]) -> TrainedLifted:
         plain = super().trained(networks, stage, room_ids)
         sampler = ready_copy(networks.sampler) if hasattr(networks, "sampler") else None
-        return TrainedLifted(plain.prior, plain.logits, room_ids, self, stage, sampler)
+        return TrainedLifted(plain.prior, room_ids, self, stage, plain.logits, sampler)
 
     def build_sampler(self, settings: SamplerConfig) -> RoomSampler:
         """The sampler's network, freshly initialised from the seed; `teach` sets its buffers."""

@@ -18,13 +18,6 @@ class TrainedLifted(TrainedPrior):
 
     @property
     def distribution(self) -> str:
-        """Default distribution of new rooms: `sampler` if the settings say so and the run has a
-        sampler; else the distribution of latents."""
+        """`sampler` if the settings say so and the run has one; else the latents' distribution."""
         with_sampler = self.sampler is not None and self.config.distribution == SAMPLER
         return SAMPLER if with_sampler else self.latent_distribution
-
-    @property
-    def latent_distribution(self) -> str:
-        """Distribution of new latents, for tasks that need a latent."""
-        own = self.config.distribution
-        return own if self.remembers_rooms and own != SAMPLER else "paper"

@@ -78,7 +78,7 @@ class RoomPath:
         z = self.latents(even_places(STEPS))
         with torch.no_grad(), single_threaded():
             path = self.trained.prior.decode(z, with_shape=self.trained.stage != "layout")
-        return path, kept_predictions(path, self.trained.config.model.completeness_target)
+        return path, kept_predictions(self.trained, path)
 
 
 def even_places(steps: int) -> Float[Tensor, " steps"]:

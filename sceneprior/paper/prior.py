@@ -25,7 +25,7 @@ from sceneprior.paper.decoders import (
     ShapeModuleConfig,
 )
 from sceneprior.paper.transformer import DecoderConfig
-from sceneprior.training.method import RunConfig, ready_copy
+from sceneprior.training.method import RunConfig, Trained, ready_copy
 
 
 class SphereConfig(Section):
@@ -291,7 +291,7 @@ class PriorConfig(RunConfig):
         prior, latents = networks.prior, networks.latents
         assert isinstance(prior, ScenePrior) and isinstance(latents, nn.Embedding)
         logits = latents.weight.detach().cpu().clone()
-        return TrainedPrior(ready_copy(prior), logits, room_ids, self, stage)
+        return TrainedPrior(ready_copy(prior), room_ids, self, stage, logits)
 
     def open_views(
         self, views_per_room: int, mask_step: int | None, split: str = "train"
@@ -327,27 +327,24 @@ class PriorConfig(RunConfig):
 
 
 @dataclass(frozen=True)
-class TrainedPrior:
+class TrainedPrior(Trained):
     """A trained prior with the latents of its training rooms, ready for use."""
 
     prior: ScenePrior
-    logits: Float[Tensor, "rooms logits"]
-    room_ids: tuple[str, ...]
     config: PriorConfig
-    stage: str
+    logits: Float[Tensor, "rooms logits"]
 
     @property
     def remembers_rooms(self) -> bool:
-        """True if the training rooms' latents are kept."""
         return len(self.logits) > 0
 
     @property
     def distribution(self) -> str:
-        """Default distribution of new rooms."""
         return self.latent_distribution
 
     @property
     def latent_distribution(self) -> str:
-        """Default distribution of new latents: the run's own, or `paper` if the prior lacks the
-        latents of its training rooms, as a packed prior may."""
-        return self.config.distribution if self.remembers_rooms else "paper"
+        """Default distribution of new latents: `kernel` if it is the run's own and the latents of
+        its training rooms are kept, as a packed prior may not; else `paper`."""
+        kernel = self.remembers_rooms and self.config.distribution == "kernel"
+        return "kernel" if kernel else "paper"

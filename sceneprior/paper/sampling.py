@@ -21,7 +21,7 @@ from sceneprior.core.repeatable import check_seed, single_threaded
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.core.views import DecodedScenes
 from sceneprior.paper.losses import kept_objects
-from sceneprior.paper.prior import ScenePrior, TrainedPrior
+from sceneprior.paper.prior import TrainedPrior
 from sceneprior.training.method import Trained
 
 BANDWIDTH = 0.15
@@ -125,11 +125,6 @@ def sample_logits(
     # Shrinking towards the mean offsets the variance of the noise, so the covariance is preserved.
     drawn = (1 - BANDWIDTH**2) ** 0.5 * start + BANDWIDTH * drawn
     return (mean + drawn).to(trained.dtype)
-
-
-def scene_names(count: int, seed: int) -> list[str]:
-    """Names of generated rooms."""
-    return [f"seed{seed}_{index:04d}" for index in range(count)]
 
 
 def write_latents(folder: Path, scenes: Sequence[Scene]) -> None:
@@ -259,56 +254,45 @@ class DecodedRoom(NamedTuple):
     class_logits: Float[Tensor, "objects classes"]
 
 
-def kept_predictions(decoded: DecodedScenes, target: str) -> Bool[Tensor, "rooms objects"]:
+def kept_predictions(
+    trained: TrainedPrior, decoded: DecodedScenes
+) -> Bool[Tensor, "rooms objects"]:
     """True for predictions that are objects: the completeness scores keep them, and their most
     likely class is not `void`."""
-    kept = kept_objects(decoded.completeness_logits, target)
+    kept = kept_objects(decoded.completeness_logits, trained.config.model.completeness_target)
     return kept & (decoded.class_logits.argmax(dim=-1) != VOID)
 
 
 def to_rooms(
-    decoded: DecodedScenes,
-    prior: ScenePrior,
-    label_set_name: str,
-    names: Sequence[str],
-    completeness_target: str,
+    trained: TrainedPrior, decoded: DecodedScenes, names: Sequence[str]
 ) -> list[DecodedRoom]:
-    """Convert decoded rooms to scenes of their `kept_predictions`, with their most likely classes.
-
-    `prior` is the network that decoded the rooms.
-    """
-    kept = kept_predictions(decoded, completeness_target)
+    """Scenes of the `kept_predictions` of decoded rooms, with their most likely classes."""
+    kept = kept_predictions(trained, decoded)
     rooms = []
     for row, name in enumerate(names):
         predictions = kept[row].nonzero()[:, 0].tolist()
-        scene = scene_of(decoded, row, predictions, prior, label_set_name, name)
+        scene = scene_of(trained, decoded, row, predictions, name)
         rooms.append(DecodedRoom(scene, predictions, decoded.class_logits[row, predictions]))
     return rooms
 
 
 def scene_of(
-    decoded: DecodedScenes,
-    row: int,
-    predictions: Sequence[int],
-    prior: ScenePrior,
-    label_set_name: str,
-    name: str,
+    trained: TrainedPrior, decoded: DecodedScenes, row: int, predictions: Sequence[int], name: str
 ) -> Scene:
     """A scene of the given predictions of one room, in the given order.
 
     An object has its most likely class other than void, and a mesh if shapes were decoded.
     """
-    classes = label_set(label_set_name)
+    shape, classes = trained.prior.shape, label_set(trained.config.label_set)
     objects = []
     for item in predictions:
         logits = decoded.class_logits[row, item].clone()
         logits[VOID] = -torch.inf
         center, size = (part[row, item].tolist() for part in (decoded.centers_m, decoded.sizes_m))
-        mesh = prior.shape.mesh_of(decoded, row, item)
-        solids = prior.shape.solids_of(decoded, row, item)
+        mesh, solids = shape.mesh_of(decoded, row, item), shape.solids_of(decoded, row, item)
         label = classes[int(logits.argmax())]
         objects.append(SceneObject(label, tuple(center), tuple(size), mesh, solids=solids))
-    return Scene(name, label_set_name, tuple(objects))
+    return Scene(name, trained.config.label_set, tuple(objects))
 
 
 @single_threaded()
@@ -326,14 +310,11 @@ def decode_rooms(
     Decoding runs on one thread: the networks are too small to gain from several, and on one thread
     equal latents give bit-identical rooms.
     """
-    config = trained.config
     rooms: list[DecodedRoom] = []
     for start in range(0, len(z), BATCH):
         part = slice(start, start + BATCH)
         decoded = trained.prior.decode(z[part], with_shape=trained.stage != "layout")
-        target = config.model.completeness_target
-        decoded = reshaped(decoded, part)
-        rooms += to_rooms(decoded, trained.prior, config.label_set, names[part], target)
+        rooms += to_rooms(trained, reshaped(decoded, part), names[part])
     return [
         room._replace(scene=replace(room.scene, latent=point.cpu().numpy()))
         for room, point in zip(rooms, z, strict=True)

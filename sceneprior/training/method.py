@@ -227,34 +227,27 @@ class RunConfig(Section, ABC):
             )
 
 
-@runtime_checkable
-class Trained(Protocol):
-    """Networks of a run, ready for use: a method's own class, or `TrainedSampler` or
-    `TrainedReconstructor`."""
+@dataclass(frozen=True)
+class Trained:
+    """Networks of a run, ready for use; each kind of method has its own subclass."""
 
-    @property
-    def prior(self) -> Any:
-        """The network."""
-
-    @property
-    def room_ids(self) -> tuple[str, ...]:
-        """Ids of the training rooms."""
-
-    @property
-    def config(self) -> RunConfig:
-        """Settings of the run."""
-
-    @property
-    def stage(self) -> str:
-        """The stage that was trained last."""
+    prior: Any
+    """The network."""
+    room_ids: tuple[str, ...]
+    """Ids of the training rooms."""
+    config: RunConfig
+    stage: str
+    """The stage that was trained last."""
 
     @property
     def remembers_rooms(self) -> bool:
         """True if each training room has its own latent."""
+        return False
 
     @property
     def distribution(self) -> str:
-        """Default distribution of new rooms."""
+        """Default distribution of new rooms; without latents, the name of the method."""
+        return self.config.method
 
 
 @runtime_checkable
@@ -268,22 +261,11 @@ class BoxSampler(Protocol):
     def parameters(self) -> Any: ...
 
 
-@dataclass(frozen=True)
-class TrainedSampler:
+class TrainedSampler(Trained):
     """A trained method that generates rooms of boxes from a seed alone: its rooms have no latents,
     and its objects no meshes."""
 
     prior: BoxSampler
-    room_ids: tuple[str, ...]
-    config: RunConfig
-    stage: str
-
-    remembers_rooms = False
-
-    @property
-    def distribution(self) -> str:
-        """Name of the distribution of new rooms, which is the name of the method."""
-        return self.config.method
 
 
 class FoundObject(NamedTuple):
@@ -307,18 +289,11 @@ class ViewReconstructor(Protocol):
     def parameters(self) -> Any: ...
 
 
-@dataclass(frozen=True)
-class TrainedReconstructor:
+class TrainedReconstructor(Trained):
     """A trained method that only reconstructs images: it generates no new rooms."""
 
     prior: ViewReconstructor
-    room_ids: tuple[str, ...]
-    config: RunConfig
-    stage: str
-
-    remembers_rooms = False
     distribution = "none"
-    """The method generates no new rooms."""
 
 
 def ready_copy(network: Any) -> Any:

@@ -158,6 +158,15 @@ def test_velocities_follow_the_order_of_the_objects(flow, batch):
     assert (flow.velocity(moved, time, is_object) - known)[0, 4].abs().max() > 1e-6
 
 
+def test_dropout_is_of_the_settings_and_of_training_alone(flow, batch):
+    known = flow.predict(*batch)
+    for block in flow.blocks:
+        assert block.drop.p == 0.1
+    assert_close(flow.predict(*batch), known, rtol=0, atol=0)
+    flow.train()
+    assert not torch.equal(flow.predict(*batch)[0], known[0])
+
+
 def test_padding_and_neighbours_in_the_batch_mean_nothing(flow, batch):
     tokens, time, is_object = batch
     numbers, logits = flow.predict(*batch)

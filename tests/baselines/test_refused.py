@@ -7,7 +7,8 @@ import pytest
 from refusals import refused
 from tiny_runs import tiny_baseline, tiny_baseline_settings
 
-from sceneprior.apps.config import check_config, load_any_run, load_run
+from sceneprior.apps.api import load
+from sceneprior.apps.config import check_config, load_any_run
 from sceneprior.apps.reconstruction.reconstruct import reconstruct
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.errors import ConfigError, ShardError
@@ -76,10 +77,10 @@ def test_methods_under_2d_supervision_never_read_it(baseline_config, monkeypatch
 
 def test_tasks_that_need_latents(baseline_run):
     run = baseline_run("atiss")
-    atiss, gan = load_any_run(run), load_run(baseline_run("gan"))
+    atiss, gan = load_any_run(run), load(baseline_run("gan")).with_latents
     assert gan.logits.shape == (0, 10) and gan.room_ids == () and gan.distribution == "paper"
     for name, call in {
-        "load_run": lambda: load_run(run),
+        "load_run": lambda: load(run).with_latents,
         "decode": lambda: decode_training_rooms(atiss),
         "kernel": lambda: sample_rooms(atiss, 2, 0, "kernel"),
         "floor": lambda: sample_rooms(atiss, 2, 0, request=RoomRequest.of(floor="4x3")),
@@ -97,7 +98,7 @@ def test_tasks_of_what_reconstructs_images(baseline_run, toy_shards):
     trained, (images, _) = load_any_run(run), images_of_split(toy_shards, "test", limit=1)
     for name, call in {
         "image_sample": lambda: sample_rooms(trained, 2, 0),
-        "image_load": lambda: load_run(run),
+        "image_load": lambda: load(run).with_latents,
         "image_fit": lambda: reconstruct(trained, images, "paper"),
     }.items():
         with refused(f"baselines/{name}", run=run):

@@ -3,13 +3,14 @@
 import pickle
 import sys
 from pathlib import Path
+from typing import NamedTuple
 
 import parallel_tasks
 import pytest
 from refusals import refused
 
 from sceneprior.core import parallel
-from sceneprior.core.parallel import on_workers, run_tasks
+from sceneprior.core.parallel import map_blocks, on_workers, run_tasks
 
 
 def tasks(*arguments):
@@ -23,6 +24,17 @@ def test_results_come_in_order_and_failures_by_name(tmp_path, workers):
         with refused("core/tasks that failed", tmp=tmp_path):
             run_tasks(parallel_tasks.fail_at_two, tasks(tmp_path))
     assert len(list(tmp_path.iterdir())) == 6, "the others go on"
+
+
+class Named(NamedTuple):
+    name: str
+    number: int
+
+
+def test_items_of_one_name_are_all_mapped():
+    items = [Named("same", number) for number in range(5)]
+    found = map_blocks(lambda some, first: [(item.number, first) for item in some], items, 2)
+    assert found == [(0, 0), (1, 0), (2, 2), (3, 2), (4, 4)]
 
 
 def test_after_many_failures_no_other_task_begins(tmp_path, monkeypatch):

@@ -104,6 +104,8 @@ def test_json_by_name_and_floor_plans_are_read(tmp_path):
         ({"sizes": np.zeros((2, 3))}, "sizes above 0"),
         ({"sizes": np.full((2, 3), 90)}, r"a desk .* Are these centimetres\? Give metres"),
         ({"class_labels": np.zeros((2, 0))}, "neither names, indices nor one-hot rows"),
+        ({"class_labels": np.zeros((2, 21))}, "rows without a 1"),
+        ({"class_labels": np.full((2, 21), np.nan)}, "rows without a 1"),
         ({"angles": np.zeros((2, 1), complex)}, "must be arrays, the last three of numbers"),
         ({key: np.ones((1001, 3)) for key in ("translations", "sizes")}
          | {"angles": np.zeros(1001), "class_labels": np.ones(1001, int)}, "1001 objects"),

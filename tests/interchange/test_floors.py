@@ -2,6 +2,7 @@
 rooms of Structured3D have their doors and windows."""
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +55,20 @@ def _bare_scene(folder: Path) -> str:
     return f"{folder}/bare.json"
 
 
+def _house_with(*corner_m: float):
+    """A house whose floor is one triangle: two short sides, to the given corner."""
+
+    def write(folder: Path) -> str:
+        mesh = {"uid": "a", "type": "Floor", "faces": [0, 1, 2]}
+        mesh["xyz"] = [0, 0, 0, *corner_m, 1e-9, 0, 0]
+        room = {"instanceid": "Bedroom-0", "children": [{"ref": "a"}]}
+        house = {"scene": {"room": [room]}, "mesh": [mesh]}
+        (folder / "room.json").write_text(json.dumps(house))
+        return f"{folder}/room.json"
+
+    return write
+
+
 def _boxes_without_floor(folder: Path) -> str:
     np.savez(folder / "boxes.npz", sizes=np.zeros((0, 3)))
     return f"{folder}/boxes.npz"
@@ -77,7 +92,13 @@ def _text(content: str, name: str = "floor.json"):
         (_text("no archive", "broken.npz"), "cannot be read"),
         (_bare_scene, "a scene without a floor; give one with floor_m"),
         (_boxes_without_floor, "has no floor; expected floor_plan_vertices"),
-        (_room_that_is_none, r"the rooms Bedroom-0; name one of them as room\.json:"),
+        (
+            _room_that_is_none,
+            r"room\.json has the rooms Bedroom-0; name one of them as room\.json:",
+        ),
+        (_house_with(math.nan, 0, 1), "no house of 3D-FRONT .*xyz of a floor is not finite"),
+        (_house_with(math.inf, 0, 1), "no house of 3D-FRONT .*xyz of a floor is not finite"),
+        (_house_with(0, 0, 1e-9), "room Bedroom-0 has no floor"),
     ],
 )
 def test_what_has_no_floor_is_a_sentence(write, message, tmp_path):

@@ -41,7 +41,7 @@ def paper(toy_shards):
     config = tiny_config(toy_shards)
     prior = untrained(config)
     logits = config.build_latents(12).weight.detach() * 2
-    return TrainedPrior(prior, logits, tuple(f"room_{k}" for k in range(12)), config, "shape")
+    return TrainedPrior(prior, tuple(f"room_{k}" for k in range(12)), config, "shape", logits)
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,7 @@ def lifted(toy_shards, rooms):
     prior = untrained(config)
     prior.shape.set_prototypes(rooms.find_prototypes(config.model.shape.prototypes))
     logits = config.build_latents(12).weight.detach() * 2
-    return TrainedLifted(prior, logits, tuple(rooms.plain_ids), config, "shape")
+    return TrainedLifted(prior, tuple(rooms.plain_ids), config, "shape", logits)
 
 
 def check(name: str, **found) -> None:

@@ -9,15 +9,15 @@ from refusals import refused
 from tiny_runs import tiny_config
 from torch.testing import assert_close
 
-from sceneprior.apps.config import load_run
+from sceneprior.apps.api import load
 from sceneprior.core.scene import Scene
 from sceneprior.core.views import DecodedScenes
+from sceneprior.paper.prior import TrainedPrior
 from sceneprior.paper.sampling import (
     DISTRIBUTIONS,
     draw_latents,
     read_latent,
     sample_logits,
-    scene_names,
     to_rooms,
     write_latents,
 )
@@ -25,7 +25,7 @@ from sceneprior.paper.sampling import (
 
 @pytest.fixture(scope="module")
 def toy_prior(toy_run):
-    return load_run(toy_run)
+    return load(toy_run).with_latents
 
 
 @pytest.mark.parametrize("distribution", DISTRIBUTIONS)
@@ -76,7 +76,7 @@ def rooms_of(z, names):
 
 def test_files(toy_prior, tmp_path):
     z = draw_latents(toy_prior, 4, seed=2)
-    write_latents(tmp_path, rooms_of(z, scene_names(4, 2)))
+    write_latents(tmp_path, rooms_of(z, [f"seed2_{k:04d}" for k in range(4)]))
     npz = tmp_path / "latents.npz"
     # Close: a file's vector is normalised once more.
     for end, row in (("", 0), (":2", 2), (":seed2_0003", 3)):
@@ -118,19 +118,20 @@ def decoded(torch_rng) -> DecodedScenes:
 
 
 @pytest.fixture
-def prior(tmp_path):
+def trained(tmp_path):
     """A prior whose meshes have two triangles."""
-    prior = tiny_config(tmp_path).build_prior()
+    config = tiny_config(tmp_path)
+    prior = config.build_prior()
     prior.shape.faces = torch.tensor([[0, 1, 2], [3, 4, 5]])
-    return prior
+    return TrainedPrior(prior, (), config, "shape", torch.zeros(0, 4))
 
 
 def labels(scene) -> list[str]:
     return [item.label for item in scene.objects]
 
 
-def test_a_scene_ends_at_the_first_object_whose_completeness_falls(decoded, prior):
-    rooms = to_rooms(decoded, prior, "front3d_bedroom", ["a", "b"], "first_n")
+def test_a_scene_ends_at_the_first_object_whose_completeness_falls(decoded, trained):
+    rooms = to_rooms(trained, decoded, ["a", "b"])
     assert [room.predictions for room in rooms] == [[0, 1, 3], [0]]
     assert torch.equal(rooms[0].class_logits, decoded.class_logits[0, [0, 1, 3]])
     first, second = (room.scene for room in rooms)
@@ -143,4 +144,4 @@ def test_a_scene_ends_at_the_first_object_whose_completeness_falls(decoded, prio
         np.testing.assert_array_equal(item.center_m, decoded.centers_m[0, source])
         np.testing.assert_array_equal(item.size_m, decoded.sizes_m[0, source])
         np.testing.assert_array_equal(item.mesh.vertices_m, decoded.vertices_m[0, source])
-        np.testing.assert_array_equal(item.mesh.faces, prior.shape.faces)
+        np.testing.assert_array_equal(item.mesh.faces, trained.prior.shape.faces)

@@ -17,7 +17,8 @@ from interrupting import CPU, interrupted
 from refusals import refused
 from tiny_runs import tiny_config, write_tiny_config
 
-from sceneprior.apps.config import load_config, load_run
+from sceneprior.apps.api import load
+from sceneprior.apps.config import load_config
 from sceneprior.core.files import only_writer
 from sceneprior.paper import stages
 from sceneprior.training import fit as train
@@ -186,7 +187,7 @@ def test_settings_and_shards_that_do_not_fit(toy_run, toy_shards, tmp_path):
 def test_the_label_set_of_the_shards_is_the_runs(toy_shards, tmp_path):
     config = tiny_config(toy_shards, label_set="shards", layout__epochs=1, shape__epochs=1)
     fit(config, tmp_path / "run", trainer_options=CPU)
-    trained = load_run(tmp_path / "run")
+    trained = load(tmp_path / "run").with_latents
     assert trained.config.label_set == "front3d_bedroom"
     fit(config, tmp_path / "run", resume=True, trainer_options=CPU)  # no other settings
     with refused("training/no shards", tmp=tmp_path):
@@ -198,21 +199,21 @@ def test_damaged_or_foreign_checkpoints(toy_run, tmp_path):
     path = run / "shape" / "final.ckpt"
     path.write_bytes(path.read_bytes()[:1000])
     with refused("training/damaged", tmp=tmp_path):
-        load_run(run)
+        load(run)
     with refused("training/damaged", tmp=tmp_path):
         fit(load_config(str(run / "config.yaml")), run, resume=True, trainer_options=CPU)
     text = (run / "config.yaml").read_text()
     path.unlink()
     (run / "config.yaml").write_text(text.replace("width: 16", "width: 32"))
     with refused("training/of another config", tmp=tmp_path):
-        load_run(run)
+        load(run)
     shutil.rmtree(run / "layout")
     for path in run.rglob("*.ckpt"):
         path.unlink()
     with refused("training/no checkpoint", tmp=tmp_path):
-        load_run(run)
+        load(run)
     with refused("training/no run", tmp=tmp_path):
-        load_run(tmp_path)
+        load(tmp_path)
 
 
 def test_a_second_training_of_the_same_run_is_refused(toy_shards, tmp_path):

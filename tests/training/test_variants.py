@@ -7,7 +7,7 @@ import torch
 from interrupting import CPU, interrupted
 from tiny_runs import tiny_config, tiny_lifted
 
-from sceneprior.apps.config import load_run
+from sceneprior.apps.api import load
 from sceneprior.apps.decoders import AnyPaperModel
 from sceneprior.apps.experiments.report import (
     UNFOLDING_STEPS,
@@ -69,7 +69,7 @@ def test_a_variant_learns_and_is_decoded_sampled_and_interpolated(variant):
     assert [k.split("/")[0] for k in curves if k.endswith("/loss")] == (list(config.stage_names))
     losses = [value for _, value in curves[f"{config.stage_names[0]}/loss"]]
     assert losses[-1] < losses[0]
-    trained = load_run(run)
+    trained = load(run).with_latents
     assert trained.stage == "shape" and trained.config == config
     layout = getattr(config, "layout", None)
     learnt = layout is not None and layout.proxy == "beveled_box"

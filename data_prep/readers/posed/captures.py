@@ -24,6 +24,7 @@ from data_prep.readers.frames import GL_TO_CV
 from data_prep.readers.posed.cameras import Camera, Number
 from data_prep.readers.posed.recording import PosedFrame
 from data_prep.readers.reader import by_number
+from sceneprior.core.cameras import rigid
 from sceneprior.core.checked import checked, plain, shown
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import list_files, list_folders, read_bytes, read_json, read_text
@@ -279,14 +280,12 @@ def read_metadata(files: Sequence[Path]) -> Iterator[PosedFrame]:
             "expected one for each picture: export the recording again."
         )
     for number, (pose, lens) in enumerate(zip(poses, lenses, strict=True)):
-        matrix = np.eye(4)
-        matrix[:3, 3] = pose[4:]
         # A quaternion far from length 1 is invalid; scipy would reject zeros and NaN.
         known = abs(np.linalg.norm(pose[:4]) - 1) < _OFF and np.isfinite(pose).all()
-        matrix[:3, :3] = Rotation.from_quat(pose[:4]).as_matrix() if known else np.nan
+        turn = Rotation.from_quat(pose[:4]).as_matrix() if known else np.full((3, 3), np.nan)
         fx, fy, cx, cy = lens[:4]
         camera = Camera(fl_x=fx, fl_y=fy, cx=cx, cy=cy, w=read.w, h=read.h)
-        yield PosedFrame(f"{number}.jpg", matrix, camera)
+        yield PosedFrame(f"{number}.jpg", rigid(turn, pose[4:]), camera)
 
 
 class Tool(NamedTuple):

@@ -10,7 +10,7 @@ import numpy as np
 
 from data_prep.readers.frames import GL_TO_CV, is_pose
 from data_prep.readers.posed.cameras import Camera
-from sceneprior.core.cameras import odd_field_of_view
+from sceneprior.core.cameras import odd_field_of_view, rigid
 from sceneprior.core.checked import shown
 from sceneprior.core.errors import InputError
 
@@ -196,9 +196,7 @@ def _turn_of_cameras(recording: Recording, poses: np.ndarray) -> np.ndarray:
     x = np.eye(3)[np.argmin(np.abs(y))]
     x = x - (x @ y) * y
     x /= np.linalg.norm(x)
-    turn = np.eye(4)
-    turn[:3, :3] = x, y, np.cross(x, y)
-    return turn
+    return rigid((x, y, np.cross(x, y)))
 
 
 def floor_center(recording: Recording, turn: np.ndarray) -> np.ndarray | None:

@@ -175,10 +175,16 @@ def reconstruct(
             "Say what to reconstruct from, in exactly one way: --shards with --room (and --view); "
             "--shards with --split; or --mask with --intrinsics (and --classes)."
         )
-    if mask is None and any(given is not None for given in (classes, intrinsics, pose, gravity)):
-        raise InputError("--classes, --intrinsics, --pose and --gravity belong to --mask.")
-    if pose is not None and gravity is not None:
-        raise InputError("--pose already gives the direction of gravity; leave out --gravity.")
+    without_pose = [given is not None for given in (camera_height, gravity)]
+    if mask is None and any([classes, intrinsics, pose, *without_pose]):
+        raise InputError(
+            "--classes, --intrinsics, --pose, --camera-height and --gravity belong to --mask."
+        )
+    if pose is not None and any(without_pose):
+        raise InputError(
+            "--pose already gives the height and the tilt of the camera; leave out --camera-height "
+            "and --gravity."
+        )
     if (limit is not None and split is None) or (view and room is None):
         raise InputError("--limit belongs to --split, and --view to --room.")
     check_free(out, overwrite)

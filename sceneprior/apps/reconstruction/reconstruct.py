@@ -133,7 +133,10 @@ def reconstruct(
     batches = [
         size[at : at + most] for size in by_size.values() for at in range(0, len(size), most)
     ]
-    tasks = {f"batch from {images[b[0]].name} on": ([images[row] for row in b],) for b in batches}
+    tasks = {
+        f"batch {number}, from {images[batch[0]].name} on": ([images[row] for row in batch],)
+        for number, batch in enumerate(batches, start=1)
+    }
     answers = run_tasks(partial(_reconstructed, prior, fit, restarts, masks), tasks, "fitting")
     found = dict(zip(chain(*batches), chain(*answers), strict=True))
     return [found[row] for row in range(len(images))]
@@ -188,7 +191,7 @@ def _fitted(
 ) -> list[Reconstruction]:
     """Latents fitted to images of one size, from the training rooms with the lowest layout losses
     on each."""
-    views, labels = as_views(images, trained.config.data.mask_step), trained.config.label_set
+    views = as_views(images, trained.config.data.mask_step)
     refuse_crowds(trained, views)
     if restarts > len(trained.logits):
         raise InputError(
@@ -207,7 +210,7 @@ def _fitted(
     answers = []
     for image, row in zip(images, rows.tolist(), strict=True):
         predictions = found.loss.matches.prediction[row, : len(image.object_class)].tolist()
-        scene = scene_of(found.scenes, row, predictions, trained.prior, labels, image.name)
+        scene = scene_of(trained, found.scenes, row, predictions, image.name)
         mask_iou = float(found.loss.mask_iou[row]) if compared else None
         score, steps = float(found.loss.score[row]), int(found.steps[row])
         answers.append(Reconstruction(image, scene, score, mask_iou, steps))

@@ -184,7 +184,7 @@ def _objects(
     for room in rooms.unique():
         mine = slots[rooms == room].unique()
         decoded = _decode_some(trained, room[None], torch.zeros_like(mine), mine)
-        scene = scene_of(decoded, 0, mine.tolist(), trained.prior, trained.config.label_set, "")
+        scene = scene_of(trained, decoded, 0, mine.tolist(), "")
         pairs = zip(mine.tolist(), scene.objects, strict=True)
         objects |= {(int(room), slot): item for slot, item in pairs}
     found = []

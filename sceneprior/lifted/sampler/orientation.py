@@ -52,7 +52,7 @@ UNSURE_M = 0.05
 THROUGH_M = 0.3
 """Distance by which an object may reach through a wall behind it."""
 FACING = 0.98
-"""Minimum cosine between a wall's normal and that of an object's side: 11 degrees."""
+"""Minimum cosine between a wall's normal and that of a side it faces: 11 degrees."""
 STRIP = 0.2
 """Depth of the strip, as a share of a prototype's extent, whose height is that of a side."""
 

@@ -17,11 +17,12 @@ from sceneprior.lifted.prototypes import PosedRooms, Prototypes
 from sceneprior.lifted.sampler.frames import (
     FRAME_M,
     GRAZE_M,
+    OUTWARD,
     rectangle_sides,
     rectangles_of,
     shared_extents,
 )
-from sceneprior.lifted.sampler.orientation import gaps_to_walls, orient
+from sceneprior.lifted.sampler.orientation import FACING, gaps_to_walls, orient
 
 LOOSELY = 2.0
 """Range of the random offset of log footprints in `large_first`."""
@@ -30,8 +31,6 @@ SURE_M = 0.03
 AT_WALL_M = 0.45
 """Maximum gap between furniture and such a wall; drawn rooms with larger gaps are drawn again
 (`draw.py`)."""
-FACING = 0.98
-"""Minimum cosine between a wall's normal and that of the rectangle's side: 11 degrees."""
 PLAUSIBLE_SHARE = 0.2
 """Share of the training rooms with both classes in which the two must intersect for intersections
 to count as intended. Lifted boxes of chairs intersect each other in a seventh of the rooms, true
@@ -144,7 +143,7 @@ def _walls_of(walls: Sequence[Wall], rectangle_m: np.ndarray) -> list[float]:
     nearest wall that faces this side and overlaps with it along its direction."""
     middle, half = rectangle_m[:2], rectangle_m[2:] / 2
     found = []
-    for outwards in np.array([[0, -1], [-1, 0], [0, 1], [1, 0]]):
+    for outwards in OUTWARD:
         side_m = middle @ outwards + half @ abs(outwards)
         near = []
         for wall in walls:

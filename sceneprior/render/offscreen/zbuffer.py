@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numba import njit
 
-from sceneprior.core.cameras import Pinhole
+from sceneprior.core.cameras import Pinhole, rigid
 
 DIRECTIONS = 128
 """Number of directions towards the sky in which light is tested for occlusion. With 24, the floor
@@ -49,8 +49,7 @@ def sky_light(
         side = np.cross([0.0, 0.0, 1.0], towards)
         side /= np.linalg.norm(side)
         rotation = np.stack([side, np.cross(-towards, side), -towards])
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotation, [0, 0, 2 * reach_m] - rotation @ middle_m
+        pose = rigid(rotation, [0, 0, 2 * reach_m] - rotation @ middle_m)
         projection = (scale, scale, MAP_PX / 2, MAP_PX / 2)
         _, nearest = rasterize(vertices_m, faces, pose, projection, (MAP_PX, MAP_PX), False)
         # Within one pixel of the map, the depth of the floor varies by its slope over the scale. A

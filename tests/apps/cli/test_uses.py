@@ -13,7 +13,7 @@ from cli_helpers import everything_in, one_sentence
 from model_folder import corner_sofa, write_models
 
 from sceneprior.apps import api
-from sceneprior.apps.config import load_run
+from sceneprior.apps.api import load
 from sceneprior.apps.priors.packed import shipped_priors
 from sceneprior.apps.rooms import write_scenes
 from sceneprior.core.scene import Scene, SceneObject
@@ -112,7 +112,7 @@ def test_empty_rooms_are_written_and_named(command, toy_run, monkeypatch, furnis
 
 
 def test_interpolate(command, toy_run, rooms, tmp_path):
-    first = load_run(toy_run).room_ids[0]
+    first = load(toy_run).with_latents.room_ids[0]
     end = "rooms/latents.npz:seed0_0002"
     call = ["interpolate", "--run", toy_run, "--from", first, "--to", end]
     status, out, errors = command(*call, "--steps", 4, "--out", "way")

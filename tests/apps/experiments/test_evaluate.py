@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sceneprior.apps.config import load_run
+from sceneprior.apps.api import load
 from sceneprior.apps.experiments.evaluate import mask_scores
 from sceneprior.apps.rooms import write_scenes
 from sceneprior.apps.sample import sample_rooms
@@ -82,7 +82,7 @@ def test_a_run_without_3d_truth_has_a_page_and_scores_from_views(
     tracked = [s.read_room(r).object_class for s, r in iterate_rooms(toy_shards, "test")]
     assert scores["mean_objects_test"] == np.mean([len(labels) for labels in tracked])
     seen = np.bincount(np.concatenate(tracked), minlength=22) / sum(map(len, tracked))
-    made = sample_rooms(load_run(tmp_path / "run"), 3, 1)
+    made = sample_rooms(load(tmp_path / "run").with_latents, 3, 1)
     counts = class_counts(made).sum(0)
     logs = (np.log(share + 1e-6) for share in (seen, counts / counts.sum()))
     assert scores["category_kl"] == pytest.approx((seen * np.subtract(*logs)).sum())
@@ -102,7 +102,7 @@ def test_a_run_without_3d_truth_has_a_page_and_scores_from_views(
 
 
 def test_views_that_training_never_saw_are_held_out(toy_shards, toy_run):
-    trained = load_run(toy_run)
+    trained = load(toy_run).with_latents
     assert set(mask_scores(trained, toy_shards)) == {"mask_iou_training_views"}
     data = trained.config.data.model_copy(update={"view_fraction": 0.5})
     half = replace(trained, config=trained.config.model_copy(update={"data": data}))

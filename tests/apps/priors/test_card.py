@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from sceneprior.apps.config import load_run
+from sceneprior.apps.api import load
 from sceneprior.apps.priors.card import UNSTATED, model_card
 from sceneprior.core.classes import label_set
 
@@ -20,7 +20,7 @@ SCORES = {
 
 @pytest.fixture(scope="module")
 def trained(sampler_run):
-    return load_run(sampler_run)
+    return load(sampler_run).with_latents
 
 
 def test_data_scores_and_limits_stand_in_it(trained, tmp_path):

@@ -15,7 +15,8 @@ from refusals import refused
 from safetensors.torch import load, save
 from tiny_runs import tiny_baseline, tiny_config
 
-from sceneprior.apps.config import load_any_run, load_config, load_run
+import sceneprior
+from sceneprior.apps.config import load_any_run, load_config
 from sceneprior.apps.priors.packed import (
     CARD,
     CONFIG,
@@ -65,7 +66,10 @@ def assert_same(rooms: list[Scene], others: list[Scene]) -> None:
 
 
 def test_a_sampler_s_rooms_are_the_same_to_the_bit(sampler_run, sampler_file):
-    trained, back = load_run(sampler_run), load_run(sampler_file)
+    trained, back = (
+        sceneprior.load(sampler_run).with_latents,
+        sceneprior.load(sampler_file).with_latents,
+    )
     assert_same(sample_rooms(trained, 4, 3), sample_rooms(back, 4, 3))
     given = RoomRequest(objects=[BED])
     assert_same(*(sample_rooms(one, 2, 0, request=given) for one in (trained, back)))
@@ -75,12 +79,16 @@ def test_a_sampler_s_rooms_are_the_same_to_the_bit(sampler_run, sampler_file):
 
 
 def test_without_latents_rooms_come_from_anywhere_and_are_not_remembered(sampler_run, sampler_file):
-    back = load_run(sampler_file)
+    back = sceneprior.load(sampler_file).with_latents
     assert not back.remembers_rooms and back.room_ids == () and len(back.logits) == 0
     assert (back.distribution, back.latent_distribution) == ("sampler", "paper")
-    assert read_packed(sampler_file).said.training_rooms == len(load_run(sampler_run).room_ids)
+    assert read_packed(sampler_file).said.training_rooms == len(
+        sceneprior.load(sampler_run).with_latents.room_ids
+    )
     held = sampler_file.read_bytes()
-    assert not any(name.encode() in held for name in load_run(sampler_run).room_ids)
+    assert not any(
+        name.encode() in held for name in sceneprior.load(sampler_run).with_latents.room_ids
+    )
     with pytest.raises(
         InputError, match=r"kernel .* of at least 2 training rooms, and this prior keeps 0"
     ):
@@ -119,7 +127,7 @@ def test_half_precision_is_smaller_and_nearly_the_same(
     monkeypatch.setattr("sceneprior.apps.priors.packed.FEW", 64)  # the toy's tensors are small
     small = packed_file(sampler_run, tmp_path / "half.prior", half=True)
     assert small.stat().st_size < 0.9 * sampler_file.stat().st_size
-    one, other = load_run(sampler_file), load_run(small)
+    one, other = sceneprior.load(sampler_file).with_latents, sceneprior.load(small).with_latents
     for name, value in one.prior.state_dict().items():
         found = other.prior.state_dict()[name]
         assert found.dtype == value.dtype

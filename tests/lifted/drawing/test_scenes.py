@@ -9,7 +9,6 @@ import trimesh
 from refusals import refused
 
 import sceneprior
-from sceneprior.apps.config import load_run
 from sceneprior.apps.priors.packed import shipped_priors
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.classes import label_set
@@ -47,7 +46,7 @@ def assert_on_floor(room: Scene) -> None:
 
 
 def test_rooms_come_from_the_sampler_and_others_if_asked(sampler_run, few_attempts):
-    trained = load_run(sampler_run)
+    trained = sceneprior.load(sampler_run).with_latents
     made = sample_rooms(trained, 3, 5)
     assert [scene.latent for scene in made] == [None] * 3 and made[0].name == "seed5_0000"
     assert all(item.mesh is not None for room in made for item in room.objects)
