@@ -49,7 +49,7 @@ BUDGET = {
     "sceneprior/lifted": (9084, 45),
     "sceneprior/baselines": (2924, 14),
     "sceneprior/evaluation": (4474, 21),
-    "sceneprior/interchange": (919, 5),
+    "sceneprior/interchange": (920, 5),
     "sceneprior/apps": (7380, 42),
 }
 """Most lines and modules of a folder. They go down freely, and up only in a commit that says what

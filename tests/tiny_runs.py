@@ -107,7 +107,15 @@ TINY_BASELINES: dict[str, dict[str, Any]] = {
         "training": {"epochs": 6, "batch_size": 5, "learning_rate": 3e-3},
     },
     "set_flow": {
-        "model": {"max_objects": 6, "width": 16, "layers": 1, "heads": 2, "hidden": 16, "steps": 4},
+        "model": {
+            "max_objects": 6,
+            "width": 16,
+            "layers": 1,
+            "heads": 2,
+            "hidden": 16,
+            "dropout": 0.0,
+            "steps": 4,
+        },
         "training": {"epochs": 6, "batch_size": 5, "learning_rate": 5e-3},
     },
     "usl": {

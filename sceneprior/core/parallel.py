@@ -202,8 +202,8 @@ def map_blocks(
     """Call `function(some, first)` in a task for every `size` items; `first` is the index of their
     first. Returns all results in one list."""
     tasks = {
-        f"items from number {first + 1} on": (items[first:][:size], first)
-        for first in range(0, len(items), size)
+        f"items from {k + 1}, {getattr(items[k], 'name', 'unnamed')}, on": (items[k:][:size], k)
+        for k in range(0, len(items), size)
     }
     return [each for part in run_tasks(function, tasks, title or None) for each in part]
 

@@ -142,6 +142,8 @@ def _objects(
     for label, center, size, angle in zip(labels, *(room[key] for key in NEEDED[1:]), strict=True):
         if label == "end":
             break
+        if label is None:
+            raise InputError(f"{path}: a row of class_labels has no class; leave that object out.")
         if label in NOT_FURNITURE:
             continue
         if label not in known:
@@ -155,13 +157,11 @@ def _objects(
 
 def _label_names(
     path: Path, labels: np.ndarray, columns: Sequence[str], may_have_ends: bool
-) -> list[str]:
-    """Names of class indices or one-hot rows."""
+) -> list[str | None]:
+    """Names of class indices or one-hot rows; None for rows of zeros, or with NaN."""
     if labels.dtype.kind not in "fiub" or labels.shape[1:] == (0,):
         raise InputError(f"{path}: class_labels are neither names, indices nor one-hot rows.")
     one_hot = labels.ndim == 2
-    if one_hot and not (labels.max(-1) > 0).all():
-        raise InputError(f"{path}: class_labels have rows without a 1; leave out such objects.")
     rows = labels.argmax(-1) if one_hot else labels.astype(int)
     wide = labels.shape[1] if one_hot else int(rows.max(initial=-1)) + 1
     if may_have_ends and one_hot and wide == len(columns) + 2:
@@ -171,7 +171,8 @@ def _label_names(
             f"{path}: class_labels have {wide} columns, but there are {len(columns)} names; give "
             "all names in order with --classes, including start, end and empty."
         )
-    return [columns[row] for row in rows]
+    blank = (labels == 0).all(-1) | (labels != labels).any(-1) if one_hot else rows < 0
+    return [None if without else columns[row] for row, without in zip(rows, blank, strict=True)]
 
 
 def turned_box(

@@ -151,9 +151,9 @@ def _front_floor(path: Path, house: dict[str, Any], room_id: str) -> np.ndarray:
     try:
         rooms = {str(room["instanceid"]): room for room in house["scene"]["room"]}
         if room_id not in rooms and (room_id or len(rooms) != 1):
-            listed = ", ".join(rooms)
+            listed = ", ".join(rooms)[:300] or "none"
             raise InputError(
-                f"{path} has the rooms {listed[:300]}; name one of them as {path.name}:ROOM."
+                f"{path} has the rooms {listed}; name one of them as {path.name}:ROOM."
             )
         room = rooms[room_id] if room_id else next(iter(rooms.values()))
         meshes = {mesh["uid"]: mesh for mesh in house["mesh"] if mesh["type"] == "Floor"}
@@ -161,12 +161,12 @@ def _front_floor(path: Path, house: dict[str, Any], room_id: str) -> np.ndarray:
         triangles = []
         for ref in refs:
             corners = np.array(meshes[ref]["xyz"], dtype=np.float64).reshape(-1, 3)[:, [0, 2]]
-            if not np.isfinite(corners).all():
-                raise ValueError("xyz of a floor is not finite")
             triangles += list(corners[np.array(meshes[ref]["faces"], dtype=int).reshape(-1, 3)])
+        if not np.isfinite(triangles).all():
+            raise ValueError("xyz of a floor is not finite")
     except InputError:
         raise
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
         raise InputError(
             f"{path} is no house of 3D-FRONT ({type(error).__name__}: {error})."
         ) from None

@@ -80,7 +80,7 @@ def test_tasks_that_need_latents(baseline_run):
     atiss, gan = load_any_run(run), load(baseline_run("gan")).with_latents
     assert gan.logits.shape == (0, 10) and gan.room_ids == () and gan.distribution == "paper"
     for name, call in {
-        "load_run": lambda: load(run).with_latents,
+        "with_latents": lambda: load(run).with_latents,
         "decode": lambda: decode_training_rooms(atiss),
         "kernel": lambda: sample_rooms(atiss, 2, 0, "kernel"),
         "floor": lambda: sample_rooms(atiss, 2, 0, request=RoomRequest.of(floor="4x3")),

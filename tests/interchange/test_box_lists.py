@@ -71,6 +71,11 @@ def test_start_end_and_padding_are_no_furniture(tmp_path):
     rooms = read_box_lists(save(tmp_path, "a.npz", class_labels=labels, **several), BEDROOM)
     assert [scene.name for scene in rooms] == ["a_0000", "a_0001"]
     assert [labels_of(scene) for scene in rooms] == [["desk"], ["double_bed", "desk", "desk"]]
+    # After the `end` of each room, rows may be empty; scores may all be negative.
+    padded = labels * (np.arange(5) <= [[1], [3]])[..., None]
+    for name, values in (("padded", padded), ("scores", labels - 2.0)):
+        path = save(tmp_path, f"{name}.npz", class_labels=values, **several)
+        assert [*map(labels_of, read_box_lists(path, BEDROOM))] == [*map(labels_of, rooms)]
     path = save(tmp_path, class_labels=np.array([2, 1, 0, 1, 2]), **row)
     (scene,) = read_box_lists(path, BEDROOM, "double_bed, empty, desk")
     assert labels_of(scene) == ["desk", "double_bed", "desk"]
@@ -104,8 +109,8 @@ def test_json_by_name_and_floor_plans_are_read(tmp_path):
         ({"sizes": np.zeros((2, 3))}, "sizes above 0"),
         ({"sizes": np.full((2, 3), 90)}, r"a desk .* Are these centimetres\? Give metres"),
         ({"class_labels": np.zeros((2, 0))}, "neither names, indices nor one-hot rows"),
-        ({"class_labels": np.zeros((2, 21))}, "rows without a 1"),
-        ({"class_labels": np.full((2, 21), np.nan)}, "rows without a 1"),
+        ({"class_labels": np.zeros((2, 21))}, "a row of class_labels has no class"),
+        ({"class_labels": np.full((2, 21), np.nan)}, "a row of class_labels has no class"),
         ({"angles": np.zeros((2, 1), complex)}, "must be arrays, the last three of numbers"),
         ({key: np.ones((1001, 3)) for key in ("translations", "sizes")}
          | {"angles": np.zeros(1001), "class_labels": np.ones(1001, int)}, "1001 objects"),

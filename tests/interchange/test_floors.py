@@ -98,7 +98,9 @@ def _text(content: str, name: str = "floor.json"):
         ),
         (_house_with(math.nan, 0, 1), "no house of 3D-FRONT .*xyz of a floor is not finite"),
         (_house_with(math.inf, 0, 1), "no house of 3D-FRONT .*xyz of a floor is not finite"),
+        (_house_with(10**400, 0, 1), "no house of 3D-FRONT .OverflowError"),
         (_house_with(0, 0, 1e-9), "room Bedroom-0 has no floor"),
+        (_text('{"scene": {"room": []}, "mesh": []}'), "has the rooms none; name one"),
     ],
 )
 def test_what_has_no_floor_is_a_sentence(write, message, tmp_path):

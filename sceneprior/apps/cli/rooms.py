@@ -175,12 +175,12 @@ def reconstruct(
             "Say what to reconstruct from, in exactly one way: --shards with --room (and --view); "
             "--shards with --split; or --mask with --intrinsics (and --classes)."
         )
-    without_pose = [given is not None for given in (camera_height, gravity)]
-    if mask is None and any([classes, intrinsics, pose, *without_pose]):
+    of_mask = (classes, intrinsics, pose, camera_height, gravity)
+    if mask is None and any(given is not None for given in of_mask):
         raise InputError(
             "--classes, --intrinsics, --pose, --camera-height and --gravity belong to --mask."
         )
-    if pose is not None and any(without_pose):
+    if pose is not None and not (camera_height is None and gravity is None):
         raise InputError(
             "--pose already gives the height and the tilt of the camera; leave out --camera-height "
             "and --gravity."
