@@ -138,7 +138,7 @@ def draw_silhouettes(prior: TrainedPrior, views: SceneViews, path: Path) -> None
     vertices = place(sphere[None, None], *box).requires_grad_()
     observed = (views.observed_ids[0] == item + 1).float()
     height, width = observed.shape[1:]
-    intrinsics = views.intrinsics_at(height, width)
+    intrinsics = views.mask_intrinsics()
     optimizer = torch.optim.Adam([vertices], lr=RATE_M)
     steps = []
     for _ in range(STEPS + 1):

@@ -42,7 +42,7 @@ def picture(take: Callable[[], bytes]) -> Image.Image:
 
 
 @pytest.fixture(scope="session")
-def browser() -> Iterator["webdriver.Chrome"]:
+def browser() -> Iterator:
     """A Chromium that all tests of a process share, since it starts slowly; WebGL is drawn in
     software. Its log (`browser.get_log("browser")`) lists what pages wrote and which requests were
     refused."""

@@ -40,17 +40,17 @@ MAY_TOO = {
 }
 
 BUDGET = {
-    "data_prep": (12699, 60),
-    "sceneprior/core": (6673, 30),
+    "data_prep": (12783, 60),
+    "sceneprior/core": (6701, 30),
     "sceneprior/furniture": (591, 4),
-    "sceneprior/render": (4628, 23),
-    "sceneprior/training": (1560, 9),
-    "sceneprior/paper": (2749, 13),
-    "sceneprior/lifted": (9084, 45),
-    "sceneprior/baselines": (2924, 14),
-    "sceneprior/evaluation": (4474, 21),
-    "sceneprior/interchange": (920, 5),
-    "sceneprior/apps": (7380, 42),
+    "sceneprior/render": (4618, 23),
+    "sceneprior/training": (1565, 9),
+    "sceneprior/paper": (2758, 13),
+    "sceneprior/lifted": (9107, 45),
+    "sceneprior/baselines": (2933, 14),
+    "sceneprior/evaluation": (4478, 21),
+    "sceneprior/interchange": (928, 5),
+    "sceneprior/apps": (7403, 42),
 }
 """Most lines and modules of a folder. They go down freely, and up only in a commit that says what
 it bought and what went for it."""

@@ -45,7 +45,7 @@ from sceneprior.core.files import (
 from sceneprior.core.observations import RoomGroundTruth, RoomViews
 from sceneprior.core.parallel import check_shared, run_tasks
 from sceneprior.core.scene import Mesh
-from sceneprior.core.shard_writing import check_views, shard_bytes
+from sceneprior.core.shard_writing import check_room, shard_bytes
 from sceneprior.core.shards import INDEX_NAME, MODELS_FOLDER
 from sceneprior.render.offscreen import Renderer, open_renderer
 
@@ -75,6 +75,10 @@ def build_shards(job: Job) -> Summary:
             plan = JobPlan(settings, survey.rooms, survey.left_out)
             with writing(out):
                 write_json(out / PLAN_NAME, asdict(plan))
+        elif job.retry_failed and any(line.status == "failed" for line in plan.left_out):
+            plan = plan.joined(source.survey(), source.only)
+            with writing(out):
+                write_json(out / PLAN_NAME, asdict(plan))
         return _carry_out(replace(job, out=out), plan)
 
 
@@ -88,7 +92,9 @@ def _carry_out(job: Job, plan: JobPlan) -> Summary:
     reports: dict[str, ShardReport] = {}
     for shard in shards:
         report = read_finished(out / shard.name)
-        if report is not None and not (job.retry_failed and report.has("failed")):
+        if report is None or [line.room_id for line in report.lines] != shard.room_ids:
+            continue  # unfinished, or rooms were added to it (`JobPlan.joined`)
+        if not (job.retry_failed and report.has("failed")):
             reports[shard.name] = report
     kept = len(reports)
     missing = [shard for shard in _asked_for(source, plan, shards) if shard.name not in reports]
@@ -203,7 +209,7 @@ def _prepared(
         try:
             result = source.prepare(task, renderer)
             if isinstance(result, PreparedRoom):
-                check_views(task.house, result.views)
+                check_room(task.house, result.views, result.truth)
         except Exception as error:
             result = Line(task.room_id, task.house, "failed", reason=sentence_of(error))
         lines.append(line_of(result, task, source.label_set))

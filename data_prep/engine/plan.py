@@ -30,6 +30,10 @@ class ShardTask:
     """Path within the output folder: `train/bedroom_0000.h5`."""
     rooms: tuple[RoomTask, ...]
 
+    @property
+    def room_ids(self) -> list[str]:
+        return [room.room_id for room in self.rooms]
+
 
 @dataclass(frozen=True)
 class JobPlan:
@@ -40,6 +44,24 @@ class JobPlan:
     rooms: tuple[RoomTask, ...]
     left_out: tuple[Line, ...]
     """Rooms that the survey left out."""
+
+    def joined(self, survey: Survey, only: str | None) -> "JobPlan":
+        """The plan with the rooms of a later survey that the first one left out, at the end.
+
+        `only` is that of the later survey.
+        """
+        known = {room.room_id for room in self.rooms}
+        for line in survey.left_out:  # such as rooms of another image size than most have now
+            if line.room_id in known:
+                raise InputError(
+                    f"Room {line.room_id} would now be left out ({line.reason.rstrip('.')}); give "
+                    "--out a new folder."
+                )
+        new = (room for room in survey.rooms if room.room_id not in known)
+        others = (
+            line for line in self.left_out if not is_asked_for(only, line.room_id, line.house)
+        )
+        return JobPlan(self.settings, (*self.rooms, *new), (*others, *survey.left_out))
 
     def shards(self, room_type: str) -> list[ShardTask]:
         """Group the rooms of each split, in order, into shards of `ROOMS_PER_SHARD`."""

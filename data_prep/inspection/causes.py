@@ -190,7 +190,9 @@ def _columns(change: np.ndarray) -> str:
     if (sources == range(3)).all():
         negated = [_TIMES[k] for k in np.flatnonzero(negative)]
         return f"negate the {' and '.join(negated)} column of each matrix"
-    new = [f"{'minus ' * negative[k]}the {_TIMES[source]}" for k, source in enumerate(sources)]
+    new = [
+        f"{'minus ' * bool(negative[k])}the {_TIMES[source]}" for k, source in enumerate(sources)
+    ]
     return f"let the first three columns of each matrix be {', '.join(new)}"
 
 

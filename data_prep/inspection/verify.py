@@ -160,7 +160,8 @@ def _mistakes(folder: Path, rooms: Sequence[RoomCheck]) -> list[str]:
             return None
         files = [check.convention.file for check in checks]
         usual = checks[files.index(max(files, key=files.count))].convention
-        most = sorted(checks, key=lambda check: -check.views)[:_TRIED_ROOMS]
+        whole = [check for check in checks if check.evidence is not None]
+        most = sorted(whole, key=lambda check: -check.views)[:_TRIED_ROOMS]
         return find_mistake(evidence, usual, lambda: (_read(folder, check).views for check in most))
 
     if (finding := mistake(rooms)) is not None:

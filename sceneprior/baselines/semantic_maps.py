@@ -58,15 +58,15 @@ def rendered_maps(
     to `render_scene`.
     """
     assert scenes.vertices_m is not None, "decode() adds meshes unless told not to"
-    height, width = (side / POOLING for side in views.observed_ids.shape[-2:])
+    height, width = (side // POOLING for side in views.observed_ids.shape[-2:])
     objects = scenes.vertices_m.shape[1]
     # Each object is rendered as a separate room, so that none hides another.
     alone = render_scene(
         scenes.vertices_m.flatten(0, 1).unsqueeze(1),
         faces,
         views.world_to_camera.repeat_interleave(objects, dim=0),
-        views.intrinsics_at(height, width).repeat_interleave(objects, dim=0),
-        (int(height), int(width)),  # pooling drops incomplete pixels, too
+        views.mask_intrinsics(POOLING).repeat_interleave(objects, dim=0),
+        (height, width),  # pooling drops incomplete pixels, too
         sigma_px2=SIGMA_PX2,
         mode=mode,
         compositing="alone",

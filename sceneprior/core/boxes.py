@@ -5,19 +5,14 @@ Preparing data uses this without torch.
 
 from dataclasses import dataclass
 from itertools import product
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from sceneprior.core.cameras import Array
 from sceneprior.core.errors import InputError
+from sceneprior.core.repeatable import Tensor
 from sceneprior.core.scene import Scene
-
-if TYPE_CHECKING:
-    from torch import Tensor
-else:
-    Tensor = Any  # shapes are checked all the same
 
 CUBE_CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
 """(8, 3) corners of the cube [-1, 1]^3; x changes slowest, z fastest."""
@@ -162,16 +157,6 @@ class SceneMatch:
     decoded_count: int
     truth_count: int
     """Number of true objects; like `decoded_count`, it includes unmatched objects."""
-
-    @property
-    def class_accuracy(self) -> float | None:
-        """Share of the true objects whose match has the correct class; None without objects."""
-        return float(self.correct.sum()) / self.truth_count if self.truth_count else None
-
-    @property
-    def mean_iou(self) -> float | None:
-        """Mean box IoU over the true objects; None without objects."""
-        return float(self.iou.sum()) / self.truth_count if self.truth_count else None
 
 
 def match_scenes(decoded: Scene, truth: Scene) -> SceneMatch:

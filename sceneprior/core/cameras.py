@@ -6,17 +6,12 @@ Functions take numpy arrays and torch tensors alike, except for the two that tra
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
-from sceneprior.core.repeatable import constants
-
-if TYPE_CHECKING:
-    from torch import Tensor
-else:
-    Tensor = Any  # shapes are checked all the same
+from sceneprior.core.repeatable import Tensor, constants
 
 Array = TypeVar("Array", bound=Any)
 """A numpy array or a torch tensor; data preparation does not need torch."""

@@ -71,6 +71,7 @@ def read_coco(path: Path) -> tuple[np.ndarray, dict[int, str]]:
         raise InputError(f"{path} has {len(found)} annotations; expected 1 to {LARGEST_ID - 1}.")
     size = coco.images[0].height, coco.images[0].width
     check_size(size, str(path))
+    check_ids(path, "category", [(row.id, row.name) for row in coco.categories])
     names = {row.id: row.name for row in coco.categories}
     classes, masks = {}, []
     for row, annotation in enumerate(found):
@@ -83,6 +84,17 @@ def read_coco(path: Path) -> tuple[np.ndarray, dict[int, str]]:
         masks.append((row + 1, annotation.segmentation, where))
     ids = paint(((k, decode(mask, size, where)) for k, mask, where in masks), size)
     return ids.astype(np.uint16), classes
+
+
+def check_ids(path: Path, kind: str, rows: Iterable[tuple[CocoId, str]]) -> None:
+    """Reject an id of two images or two categories, as in joined exports."""
+    first: dict[CocoId, str] = {}
+    for number, name in rows:
+        if (before := first.setdefault(number, name)) != name:
+            raise InputError(
+                f"{path}: {kind} {shown(number)} is {shown(before)} and {shown(name)}; each needs "
+                "an id of its own. If exports were joined, number them anew."
+            )
 
 
 def read_coco_json(path: Path) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Convex bodies of objects, for physics: solids, or convex parts of meshes; and their masses."""
 
+import itertools
 from functools import cache
 from typing import Any, Literal
 
@@ -24,6 +25,10 @@ SEARCH = {"mcts_iterations": 60, "mcts_nodes": 10, "resolution": 1000}
 same number of parts."""
 LEAST_M3 = 1e-9
 """Volume assumed for flat bodies."""
+THIN_M = 0.001
+"""Thickness of flat bodies for simulators, which refuse flat ones."""
+LEAST_KG = 0.001
+"""Smallest mass; simulators refuse objects without mass."""
 _FILL = {
     "box": 1.0, "cylinder": np.pi / 4, "ellipsoid": np.pi / 6, "dome": np.pi / 6, "bowl": np.pi / 6,
 }  # fmt: skip
@@ -70,6 +75,10 @@ def convex_parts(mesh: Mesh) -> tuple[Mesh, ...]:
     for piece in closed_components(mesh):
         vertices = np.asarray(piece.vertices_m, dtype=np.float64)
         found = [Mesh(*convex_surface(vertices))]
+        if volume_and_centroid(found[0])[0] <= LEAST_M3:  # flat, which simulators refuse
+            corners = np.array([*itertools.product((-THIN_M / 2, THIN_M / 2), repeat=3)])
+            parts.append(Mesh(*convex_surface((vertices[:, None] + corners).reshape(-1, 3))))
+            continue
         enough = (1 - CONCAVITY) * volume_and_centroid(found[0])[0]
         if coacd and len(found[0].faces) and volume_and_centroid(piece)[0] < enough:
             pieces = coacd.run_coacd(
@@ -168,4 +177,5 @@ def mass_kg(item: SceneObject) -> float:
     89.25
     """
     width, height, depth = item.size_m
-    return round(DENSITY_KG_M3.get(item.label, OTHER_KG_M3) * width * height * depth, 3)
+    mass = DENSITY_KG_M3.get(item.label, OTHER_KG_M3) * width * height * depth
+    return max(round(mass, 3), LEAST_KG)

@@ -103,6 +103,9 @@ def body_boxes(item: SceneObject) -> Boxes:
             continue
         points = points_of(body)
         low, high = points.min(axis=0), points.max(axis=0)
+        if not (high - low)[[0, 2]].all():  # flat, such as a pane
+            boxes.append([low, high])
+            continue
         plan = shapely.convex_hull(shapely.MultiPoint(points[:, ::2]))
         slabs = []
         for start, end in itertools.pairwise(np.linspace(low[0], high[0], SLABS + 1)):
@@ -120,14 +123,14 @@ def _set_down(objects: tuple[SceneObject, ...], changes: Counter[str]) -> list[S
     boxes = [body_boxes(item) for item in objects]
     low = np.array([each[:, 0].min(axis=0) for each in boxes]).reshape(-1, 3)
     high = np.array([each[:, 1].max(axis=0) for each in boxes]).reshape(-1, 3)
-    bottoms = low[:, 1].copy()
+    bottoms, tops = low[:, 1].copy(), high[:, 1].copy()
     for row in np.argsort(bottoms, kind="stable"):
         item, bottom, height = objects[row], bottoms[row], 0.0
         if is_fixed(item):
             continue
         if bottom > FLOOR_M:
             overlaps = np.minimum(high[row], high) - np.maximum(low[row], low) > 0
-            below = overlaps[:, [0, 2]].all(axis=1) & (np.abs(high[:, 1] - bottom) <= RESTS_M)
+            below = overlaps[:, [0, 2]].all(axis=1) & (np.abs(tops - bottom) <= RESTS_M)
             below[row] = False
             height = float(high[below, 1].max(initial=0.0))
         if abs(bottom - height) > 1e-6:
@@ -287,7 +290,8 @@ def add_supports(item: SceneObject) -> SceneObject:
     if is_stable(item):
         return item
     bodies = colliders(item)
-    feet = _feet(bodies)
+    if not (feet := _feet(bodies)):
+        return item
     mesh = item.mesh and join_meshes([item.mesh, *map(mesh_of, feet)])
     textured = item.textured and (*item.textured, *(Textured(mesh_of(foot)) for foot in feet))
     return replace(item, solids=(*bodies, *feet), mesh=mesh, textured=textured)
@@ -304,7 +308,7 @@ def is_stable(item: SceneObject) -> bool:
     )
     volumes, centers = zip(*(volume_and_centroid(body) for body in bodies), strict=True)
     middle = shapely.Point(np.average(np.array(centers), axis=0, weights=np.array(volumes))[::2])
-    if not support.contains(middle):
+    if not support.area or not support.contains(middle):  # without area: an edge or a tip
         return False
     return bool(middle.distance(support.exterior) >= MARGIN * middle.distance(plan.exterior))
 

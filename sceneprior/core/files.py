@@ -94,7 +94,7 @@ def remove_parts(folder: Path) -> None:
 
     No other process may be writing there.
     """
-    for path in sorted(Path(folder).rglob(f"*{PART}")):
+    for path in sorted(Path(folder).rglob(PARTS)):
         path.unlink(missing_ok=True)
 
 
@@ -200,9 +200,16 @@ def _entries(folder: Path, pattern: str, deep: bool = False) -> Iterator[tuple[P
         if name.startswith(".") or name in _CLUTTER:
             continue
         path = Path(folder) / name
-        if fnmatchcase(name, pattern):
+        enters = deep and is_folder and not is_link  # a link may lead back to its folder
+        if (fits := fnmatchcase(name, pattern)) or enters:
+            try:
+                name.encode()
+            except UnicodeEncodeError:
+                said = f"{folder} holds {name!a}, which is not UTF-8; rename it."
+                raise InputError(said) from None
+        if fits:
             yield path, is_folder
-        if deep and is_folder and not is_link:  # a link may lead back to its folder
+        if enters:
             yield from _entries(path, pattern, deep)
 
 

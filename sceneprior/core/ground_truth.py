@@ -10,7 +10,7 @@ import numpy as np
 
 from sceneprior.core.classes import VOID, label_set
 from sceneprior.core.errors import InputError, ShardError
-from sceneprior.core.files import check_file, reading
+from sceneprior.core.files import check_file, file_stamp, reading
 from sceneprior.core.scene import Mesh, Scene, SceneObject, Turned, mesh_of_file
 from sceneprior.core.shards import MODELS_FOLDER, Shard, iterate_rooms, splits_of
 
@@ -177,4 +177,11 @@ def load_model(path: Path) -> Mesh:
         return mesh_of_file(np.asarray(model.vertices, dtype=np.float64), model.faces)
 
 
-read_model = lru_cache(maxsize=4096)(load_model)
+def read_model(path: Path) -> Mesh:
+    """`load_model`, once for each version of a file."""
+    return _read_version(path, file_stamp(path) if path.is_file() else None)
+
+
+@lru_cache(maxsize=4096)
+def _read_version(path: Path, stamp: tuple[int, int] | None) -> Mesh:
+    return load_model(path)

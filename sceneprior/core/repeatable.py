@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 from sceneprior.core.errors import InputError
 
 if TYPE_CHECKING:
-    from torch import Tensor
+    from torch import Tensor as Tensor
 else:
-    Tensor = Any
+    Tensor = Any  # torch is imported late; shapes are checked all the same
 
 LARGEST_SEED = 2**32 - 1
 """Largest seed that NumPy, PyTorch, scikit-learn and Lightning all accept."""

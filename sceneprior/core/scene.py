@@ -125,7 +125,8 @@ class SceneObject:
     def in_box(self, center_m: Sequence[float], size_m: Sequence[float]) -> "SceneObject":
         """Copy of the object in another box; mesh and solids are moved and scaled accordingly."""
         center, size = _triple(center_m), _triple(size_m)
-        scale = np.asarray(size) / np.maximum(self.size_m, 1e-9)
+        # A flat object has no extent to be scaled.
+        scale = np.where(np.array(self.size_m) > 0, size / np.maximum(self.size_m, 1e-9), 1.0)
 
         def placed(points_m: np.ndarray) -> np.ndarray:
             return (points_m - np.asarray(self.center_m)) * scale + np.asarray(center)

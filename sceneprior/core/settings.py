@@ -4,6 +4,7 @@ import difflib
 import importlib.resources
 import re
 import reprlib
+import sys
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
@@ -119,6 +120,15 @@ def apply_override(data: dict[str, Any], override: str, option: str = "--set") -
         raise ConfigError(
             f"{option} {shortened(override)}: '{shortened(text)}' is not a YAML value."
         ) from None
+
+
+def as_value(text: str) -> str:
+    """A text as a value of `apply_override`: in quotes where YAML would read something else."""
+    try:
+        plain = yaml.load(text, _Loader) == text
+    except (ValueError, RecursionError, yaml.YAMLError):
+        plain = False
+    return text if plain else yaml.safe_dump(text, default_style='"', width=sys.maxsize).strip()
 
 
 def dump_settings(settings: Section, path: Path) -> None:

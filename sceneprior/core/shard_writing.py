@@ -110,8 +110,8 @@ def _images(views: RoomViews) -> dict[str, np.ndarray]:
     return images if views.stuff is None else images | {"stuff": views.stuff}
 
 
-def check_views(where: str, views: RoomViews) -> None:
-    """Check that the arrays of a room have consistent shapes and valid ids.
+def check_room(where: str, views: RoomViews, truth: RoomGroundTruth | None) -> None:
+    """Check that the arrays of a room have consistent shapes, valid ids and finite numbers.
 
     `where` is the beginning of an error's message.
     """
@@ -127,6 +127,13 @@ def check_views(where: str, views: RoomViews) -> None:
         came, shape = getattr(getattr(views, name), "shape", None), shape_of(sides, sizes)
         if came != shape:
             raise ShardError(f"{where}: {name} has shape {came}, expected {shape}.")
+    floats = {name: getattr(views, name) for name in VIEW_ARRAYS}
+    if truth is not None:
+        floats |= {name: getattr(truth, name) for name in TRUTH_ARRAYS}
+        floats["height_m"] = np.array(truth.height_m)
+    for name, values in floats.items():
+        if not np.isfinite(values).all():
+            raise ShardError(f"{where}: {name} holds numbers that are not finite.")
     highest = int(_images(views)["instance_ids"].max(initial=0))
     if highest > objects + 1:
         raise ShardError(

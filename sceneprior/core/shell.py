@@ -231,7 +231,8 @@ def _corners(outline_m: Float[np.ndarray, "corners 2"]) -> Float[np.ndarray, "so
             "The outline of a floor (floor_m) crosses or touches itself, so no walls can stand on "
             "it; list its corners in order, each once."
         )
-    corners = shapely.get_coordinates(shapely.geometry.polygon.orient(polygon).exterior)[:-1]
+    polygon = shapely.remove_repeated_points(shapely.geometry.polygon.orient(polygon))
+    corners = shapely.get_coordinates(polygon.exterior)[:-1]
     before, after = corners - np.roll(corners, 1, axis=0), np.roll(corners, -1, axis=0) - corners
     turn = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
     sharp = np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)

@@ -168,19 +168,6 @@ def chamfer_of(there_m: Float[np.ndarray, " n"], back_m: Float[np.ndarray, " m"]
     )
 
 
-def chamfer_mean(
-    a_points: Float[np.ndarray, "n 3"],
-    b_points: Float[np.ndarray, "m 3"],
-    a_tree: cKDTree | None = None,
-) -> float:
-    """Chamfer distance averaged over both directions, half of `chamfer_of`, in the points' unit.
-
-    `a_tree` is a k-d tree of `a_points`; pass it if `a_points` are compared with several sets.
-    """
-    there, back = nearest_distances(a_points, b_points, a_tree)
-    return float(there.mean() + back.mean()) / 2
-
-
 def nearest_distances(
     a_points: Float[np.ndarray, "n 3"],
     b_points: Float[np.ndarray, "m 3"],

@@ -144,13 +144,15 @@ class SceneViews(Batch):
         objects = self.is_object.sum(dim=-1)
         return self.observed_ids <= objects[:, None, None, None]
 
-    def intrinsics_at(
-        self, height: int | float, width: int | float
-    ) -> Float[Tensor, "rooms views 3 3"]:
-        """Intrinsics in pixels of images of another size."""
-        full_height, full_width = self.image_size
-        scale = constants(self.intrinsics, width / full_width, height / full_height, 1)
-        return self.intrinsics * scale[:, None]
+    def mask_intrinsics(self, pooling: int = 1) -> Float[Tensor, "rooms views 3 3"]:
+        """Intrinsics in pixels of the instance-id images (as `thinned_intrinsics`), or of images
+        in which squares of `pooling` of these pixels are one."""
+        step = round(max(self.image_size) / max(self.observed_ids.shape[-2:]))
+        shift = step / 2 - step // 2 - 0.5
+        shifted = self.intrinsics + F.pad(
+            constants(self.intrinsics, shift, shift, 0)[:, None], (2, 0)
+        )
+        return shifted / constants(self.intrinsics, step * pooling, step * pooling, 1)[:, None]
 
 
 @dataclass(frozen=True)

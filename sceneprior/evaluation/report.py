@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from sceneprior.core.boxes import match_scenes
 from sceneprior.core.classes import label_set
 from sceneprior.core.ground_truth import known_in_3d, reference_scenes
 from sceneprior.core.scene import Scene
 from sceneprior.core.shards import Shard, iterate_rooms, list_shards
 from sceneprior.evaluation.metric import EMPTY
+from sceneprior.evaluation.metrics.contents import reconstruction_scores
 from sceneprior.evaluation.page import data_uri, png_uri, write_page
 from sceneprior.evaluation.score_table import (
     RELATION_HEADINGS,
@@ -99,11 +99,11 @@ def write_report(
 
 
 def _summary(decoded: Scene, truth: Scene) -> str:
-    match = match_scenes(decoded, truth)
-    accuracy, iou = match.class_accuracy, match.mean_iou
+    found = reconstruction_scores([(decoded, truth)])
+    accuracy, iou = found["class_accuracy"], found["box_iou_3d"]
     if accuracy is None or iou is None:
         return "an empty room"
-    right = f"{percent(accuracy)} of {match.truth_count} classes right"
+    right = f"{percent(accuracy)} of {found['objects']} classes right"
     return f"{right}, mean 3D box IoU {iou:.2f}"
 
 

@@ -140,6 +140,8 @@ def evaluate_use(
         scores = {
             "format": FORMAT, "version": VERSION, "protocol": {"label_set": names, **settings}
         }  # fmt: skip
+        if shards is not None:
+            scores["protocol"] |= {"shards": Path(shards).resolve().name, "split": options.split}
     result = _merged(scores, result_of(columns))
     floors = sum(scene.floor_m is not None for scene in generated)
     result["protocol"] = {

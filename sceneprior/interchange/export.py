@@ -169,7 +169,9 @@ def _write_object(
     back, center = yaw_rotation(yaw_rad), np.asarray(item.center_m)
 
     def glb(objects: Iterable[SceneObject]) -> bytes:
-        alone = tuple(each.reshaped(lambda v: (v - center) @ back) for each in objects)
+        alone = tuple(
+            replace(each.reshaped(lambda v: (v - center) @ back), turned=None) for each in objects
+        )
         return scene_to_glb(replace(scene, objects=alone, extra={}))
 
     bodies = (replace(item, mesh=mesh_of(b), solids=(), textured=()) for b in colliders(item))

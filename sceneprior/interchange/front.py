@@ -6,6 +6,7 @@
 `prep-front` reads both. Units are metres, y is up, and rooms are centred at the origin.
 """
 
+import math
 import uuid
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,10 +15,11 @@ from typing import Any
 import numpy as np
 import shapely
 
+from sceneprior.core.boxes import yaw_rotation
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import json_text, write_json, write_whole
 from sceneprior.core.furniture import MODEL_FILE, category_table, class_of_category
-from sceneprior.core.scene import Scene
+from sceneprior.core.scene import Scene, Turned
 from sceneprior.core.shell import floor_polygon, floor_rectangle
 from sceneprior.interchange.floors import floor_plan
 from sceneprior.render.appearance import scene_meshes
@@ -45,9 +47,11 @@ def write_front(scenes: Sequence[Scene], folder: Path) -> None:
             jid = str(uuid.uuid5(uuid.NAMESPACE_OID, f"{scene.name}/{index}"))
             # As in 3D-FUTURE, a model's origin is the centre of its lower face.
             x, y, z = item.center_m
-            width, height, depth = item.size_m
+            own = item.turned or Turned(0.0, item.size_m)
+            width, height, depth = own.size_m
             origin = np.array([x, y - height / 2, z])
             vertices = np.asarray(mesh.vertices_m, dtype=np.float64) - origin
+            vertices = vertices @ yaw_rotation(own.yaw_rad)  # back, to face +z
             lines = [f"v {a:.6f} {b:.6f} {c:.6f}" for a, b, c in vertices.tolist()]
             lines += [f"f {a} {b} {c}" for a, b, c in (np.asarray(mesh.faces) + 1).tolist()]
             write_whole(models / jid / MODEL_FILE, "\n".join(lines) + "\n")
@@ -58,7 +62,9 @@ def write_front(scenes: Sequence[Scene], folder: Path) -> None:
                     "size": extent, "bbox": extent,
                 }
             )  # fmt: skip
-            place = {"instanceid": f"furniture/{index}", "pos": origin.tolist()} | _POSE
+            half = own.yaw_rad / 2
+            turn = {"rot": [0, math.sin(half), 0, math.cos(half)]}
+            place = {"instanceid": f"furniture/{index}", "pos": origin.tolist()} | _POSE | turn
             children.append({"ref": f"{index}/model"} | place)
             records.append({"model_id": jid, "super-category": "", "category": category})
         house = _house(scene, furniture, children)

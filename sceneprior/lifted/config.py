@@ -1,6 +1,5 @@
 """Settings of a run of the lifted method, and its stages, from opened data to a module."""
 
-import contextlib
 import warnings
 from functools import partial
 from pathlib import Path
@@ -10,9 +9,9 @@ import torch
 from pydantic import Field, model_validator
 from torch import nn
 
-from sceneprior.core.errors import InputWarning, ShardError
+from sceneprior.core.errors import ConfigError, InputWarning
 from sceneprior.core.settings import Section
-from sceneprior.core.shards import list_shards
+from sceneprior.core.shards import splits_of
 from sceneprior.lifted.lifting import ShapeGrid
 from sceneprior.lifted.lifting.dataset import LiftedDataset
 from sceneprior.lifted.prototype_decoder import PrototypeConfig, PrototypeDecoder
@@ -161,7 +160,14 @@ class LiftedConfig(PriorConfig):
             )
         prior, latents = self.build_prior(), self.build_latents(len(rooms))
         assert isinstance(prior.shape, PrototypeDecoder)
-        prior.shape.set_prototypes(rooms.find_prototypes(self.model.shape.prototypes))
+        most = self.model.shape.prototypes
+        found = rooms.find_prototypes(most)
+        if (least := len(found.object_class)) > most:
+            raise ConfigError(
+                f"model.shape.prototypes is {most}, but the rooms have objects of {least} classes, "
+                f"each of which needs a prototype; set it to {least} or more."
+            )
+        prior.shape.set_prototypes(found)
         stage = LiftedStage(self, self.shape, prior, latents)
         stage.rooms = rooms
         return stage
@@ -179,8 +185,11 @@ class LiftedConfig(PriorConfig):
         sampler = self.build_sampler(stage)
         teach(sampler, rooms.assign_prototypes(prototypes))
         val = None
-        with contextlib.suppress(ShardError):  # no val rooms: the newest network is kept
-            list_shards(Path(self.data.shards), "val")
+        if "val" in splits_of(Path(self.data.shards)):  # or else the newest network is kept
             val = self._sampler_rooms("val").assign_prototypes(prototypes, rooms.backs)
+            if not val.rooms.is_object.any():
+                said = "The val rooms have no object that looks like one of the training rooms'"
+                warnings.warn(f"{said}; so the newest network is kept.", InputWarning, 2)
+                val = None
         latents = nn.Embedding.from_pretrained(before.logits)
         return SamplerStage(before.prior, latents, sampler, stage, val, self.seed)

@@ -177,7 +177,7 @@ def seen_masks(
         vertices_m,
         faces,
         views.world_to_camera,
-        views.intrinsics_at(height, width),
+        views.mask_intrinsics(),
         (height, width),
         sigma_px2=settings.sigma_px2,
         mode=settings.silhouettes,

@@ -209,7 +209,7 @@ def html_of(scene: Scene) -> str:
     picture = base64.b64encode(png_bytes(perspective(scene))).decode()
     return (
         f'<figure><img src="data:image/png;base64,{picture}" alt="a room">'
-        f"<figcaption>{html.escape(scene.name)}: {scene.contents}</figcaption></figure>"
+        f"<figcaption>{html.escape(f'{scene.name}: {scene.contents}')}</figcaption></figure>"
     )
 
 

@@ -202,9 +202,10 @@ class RollingCheckpoint(Callback):
     def on_train_epoch_end(self, trainer: lightning.Trainer, pl_module) -> None:
         loss = float(trainer.callback_metrics.get(self.monitor, math.inf))
         better, self.best = loss < self.best, min(loss, self.best)
-        write_checkpoint(trainer, self.folder, "last.ckpt")
+        # The best first: a run stopped between the two writes repeats this epoch when it goes on.
+        write_checkpoint(trainer, self.folder, "best.ckpt" if better else "last.ckpt")
         if better:
-            copy_checkpoint(trainer, self.folder, "last.ckpt", "best.ckpt")
+            copy_checkpoint(trainer, self.folder, "best.ckpt", "last.ckpt")
         self.written = True
 
 

@@ -245,6 +245,9 @@ def _train(
     if settings.keep != "last" and rolling.best < math.inf:
         copy_checkpoint(trainer, folder, "best.ckpt", "final.ckpt")
     else:
+        if settings.keep != "last":
+            why = f"keep is '{settings.keep}', but no epoch has a {monitor}"
+            warnings.warn(f"{why}; so the last epoch is kept.", InputWarning, 2)
         write_checkpoint(trainer, folder, "final.ckpt")
 
 

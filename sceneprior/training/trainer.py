@@ -40,8 +40,9 @@ ELSEWHERE = {
     "plugins": "`fit` sets those of SLURM itself",
 }
 """Arguments of the Trainer that `fit` sets itself, and where they are set instead."""
-PRECISIONS = ("32-true", "bf16-mixed", "64-true", "bf16-true", "32", "64", "bf16", 32, 64)
-"""Precisions without gradient scaling, whose infinities would stop the run."""
+PRECISIONS = ("32-true", "bf16-mixed", "32", "bf16", 32)
+"""Precisions that train: float16 needs gradients scaled until they are infinite, which would stop
+the run, and losses in float32 do not fit weights in bfloat16 or float64."""
 
 
 def trainer_arguments(config: RunConfig, options: dict[str, Any]) -> dict[str, Any]:
@@ -57,8 +58,8 @@ def trainer_arguments(config: RunConfig, options: dict[str, Any]) -> dict[str, A
             warnings.warn(f"trainer.{name} is left out: {ELSEWHERE[name]}.", InputWarning, 2)
     if given.get("precision", "32-true") not in PRECISIONS:
         raise ConfigError(
-            f"precision is '{given['precision']}', which is not supported: its gradients are "
-            "scaled until they are infinite, and infinite values stop a run. Use bf16-mixed."
+            f"precision is '{given['precision']}', which is not supported: losses are computed in "
+            "32 bits, and gradients are not scaled. Use 32-true or bf16-mixed."
         )
     return {name: value for name, value in given.items() if name not in ELSEWHERE}
 

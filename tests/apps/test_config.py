@@ -10,7 +10,7 @@ from tiny_runs import write_tiny_config
 from sceneprior.apps.config import load_config
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import ConfigError, InputError
-from sceneprior.core.settings import dump_settings, find_config
+from sceneprior.core.settings import apply_override, as_value, dump_settings, find_config
 from sceneprior.paper.settings import Steps
 
 FOLDER = Path(__file__).parents[2] / "configs"
@@ -32,6 +32,17 @@ def test_shipped_configs_load_and_survive_being_saved(path, tmp_path):
     config = load_config(str(path))
     dump_settings(config, tmp_path / "saved.yaml")
     assert load_config(str(tmp_path / "saved.yaml")) == config
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["my #1/shards", "2024", "true", "a: b", "plain/path", "~", "", " a", "1e5", "[x", "é #"],
+)
+def test_texts_of_commands_are_read_as_they_are(text):
+    data = {}
+    apply_override(data, f"data.shards={as_value(text)}")
+    assert data == {"data": {"shards": text}}
+    assert (as_value(text) == text) == (text == "plain/path")
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=name_of)

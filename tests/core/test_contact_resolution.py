@@ -7,8 +7,20 @@ import pytest
 import trimesh
 from rooms_of_solids import solid_box
 
-from sceneprior.core.colliders import colliders, convex_parts, mesh_of, volume_and_centroid
-from sceneprior.core.contact_resolution import add_supports, is_stable, make_stable
+from sceneprior.core.colliders import (
+    colliders,
+    convex_parts,
+    mass_kg,
+    mesh_of,
+    volume_and_centroid,
+)
+from sceneprior.core.contact_resolution import (
+    add_supports,
+    body_boxes,
+    is_stable,
+    make_stable,
+)
+from sceneprior.core.parts import convex_surface
 from sceneprior.core.scene import Mesh, Scene, SceneObject, Solid, Turned
 
 KINDS = ("box", "cylinder", "ellipsoid", "dome", "bowl")
@@ -62,6 +74,49 @@ def test_a_table_on_one_side_gets_feet_and_keeps_its_solids():
     assert lowest == {0.0}
     assert len(better.mesh.faces) == len(table.mesh.faces) + 4 * 12
     assert add_supports(better) is better
+
+
+@pytest.mark.parametrize("ends", [[(0, 0)], [(-0.5, 0), (0.5, 0)], [(0, -0.5), (0, 0.5)]], ids=str)
+def test_nothing_is_stable_on_a_tip_or_an_edge(ends):
+    """A pyramid upside down, and wedges along x and z."""
+    upper = [(x, 1.0, z) for x in (-0.5, 0.5) for z in (-0.5, 0.5)]
+    mesh = Mesh(*convex_surface(np.array(upper + [(x, 0.0, z) for x, z in ends])))
+    assert not is_stable(SceneObject("stool", (0.0, 0.5, 0.0), (1.0, 1.0, 1.0), mesh))
+
+
+@pytest.fixture(params=range(3))
+def pane(request) -> trimesh.Trimesh:
+    """A box that is flat along an axis."""
+    box = trimesh.creation.box((0.4, 0.4, 0.4))
+    box.vertices[:, request.param] = 0.0
+    return box
+
+
+def test_the_parts_of_a_flat_mesh_have_a_volume(pane):
+    (part,) = convex_parts(Mesh(pane.vertices, pane.faces))
+    assert volume_and_centroid(part)[0] == pytest.approx(0.4**2 * 0.001, rel=0.01)
+    np.testing.assert_allclose(np.ptp(part.vertices_m, axis=0), pane.extents + 0.001)
+
+
+def test_a_flat_body_has_a_flat_box(pane):
+    bodies = (Mesh(pane.vertices, pane.faces),)
+    boxes = body_boxes(SceneObject("shelf", (0.0, 0.0, 0.0), tuple(pane.extents), solids=bodies))
+    bounds = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
+    np.testing.assert_allclose(bounds, pane.bounds, atol=1e-12)
+
+
+@pytest.mark.parametrize("side_m", [0.0, 0.01])
+def test_no_object_is_without_mass(side_m):
+    assert mass_kg(SceneObject("stool", (0.0, 0.0, 0.0), (side_m,) * 3)) == 0.001
+
+
+def test_a_lamp_comes_down_with_its_table():
+    table = solid_box("table", (0.0, 0.6, 0.0), (1.0, 0.7, 1.0))
+    lamp = solid_box("lamp", (0.2, 1.15, 0.2), (0.3, 0.4, 0.3))
+    scene, told = standing(table, lamp)
+    assert told == {"set down": 2}
+    bottoms_m = scene.centers_m[:, 1] - scene.sizes_m[:, 1] / 2
+    np.testing.assert_allclose(bottoms_m, [0.0, 0.7], atol=1e-9)
 
 
 def test_turned_boxes_are_bodies_at_their_angle():

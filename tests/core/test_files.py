@@ -53,10 +53,12 @@ def test_what_was_there_stays_if_writing_fails(tmp_path, monkeypatch, step):
 
 def test_leftovers_go_and_nothing_else(tmp_path):
     (tmp_path / "deep").mkdir()
-    for name in (f"x.12{PART}", f"deep/y.h5.ab{PART}", "deep/part", "z.partly"):
+    own = ["deep/part", f"deep/video.mp4{PART}", f"thesis{PART}", f"x.12{PART}", "z.partly"]
+    for name in (*own, f"x.1234abcd{PART}", f"deep/y.h5.98765432{PART}"):
         (tmp_path / name).touch()
     remove_parts(tmp_path)
-    assert sorted(p.name for p in tmp_path.rglob("*") if p.is_file()) == ["part", "z.partly"]
+    left = [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert sorted(path.relative_to(tmp_path).as_posix() for path in left) == own
 
 
 def test_a_second_writer_is_refused(tmp_path):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from sceneprior.core.observations import RoomViews
+from sceneprior.core.observations import RoomViews, thinned_intrinsics
 from sceneprior.core.shards import Shard, list_shards
 from sceneprior.core.views import as_views, image_of_room, images_of_split
 
@@ -38,3 +38,13 @@ def test_a_batch_is_one_view_a_room(toy_shards):
     for row, image in enumerate(images):
         sampled = torch.from_numpy(image.instance_ids[2::4, 2::4].astype(np.int32))
         assert torch.equal(views.instance_ids[row, 0], sampled)
+
+
+@pytest.mark.parametrize("step", [1, 2, 3, 4, 6])
+def test_cameras_of_masks_are_those_of_thinned_images(toy_shards, step):
+    images, _ = images_of_split(toy_shards, "test", 0)
+    views = as_views(images, step)
+    thin = np.array([thinned_intrinsics(image.intrinsics, step) for image in images])
+    np.testing.assert_allclose(views.mask_intrinsics()[:, 0], thin, rtol=1e-6)
+    pooled = np.diag([0.5, 0.5, 1]) @ thin
+    np.testing.assert_allclose(views.mask_intrinsics(2)[:, 0], pooled, rtol=1e-6)

@@ -20,7 +20,7 @@ from sceneprior.core.furniture import model_categories
 from sceneprior.core.id_tables import IdTable, mask_size, read_class_table, read_mask
 from sceneprior.core.scene import Opening, Scene, SceneObject, Solid
 from sceneprior.core.scene_json import read_scene, scene_to_json
-from sceneprior.core.shard_writing import check_views
+from sceneprior.core.shard_writing import check_room
 from sceneprior.core.shards import Shard, list_shards, read_index
 from sceneprior.core.shell import floor_polygon, shell_of
 from sceneprior.core.views import as_views, image_from_shards, image_of_room
@@ -171,7 +171,7 @@ DISAGREEING = {
 def test_rooms_that_disagree_with_themselves(name):
     key, value = DISAGREEING[name]
     with refused(f"core/room with {name}"):
-        check_views("a.h5", replace(make_room(), **{key: value}))
+        check_room("a.h5", replace(make_room(), **{key: value}), None)
 
 
 def exchange(name: str, **made: object) -> Callable[[h5py.Group], None]:

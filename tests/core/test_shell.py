@@ -42,6 +42,14 @@ def test_every_mesh_is_closed_and_outside_the_room(outline):
     assert sum(each.area for each in plan) == pytest.approx((whole - floor).area)
 
 
+@pytest.mark.parametrize("row", range(4))
+def test_a_corner_listed_twice_is_one_corner(row):
+    doubled = np.insert(SQUARE, row, SQUARE[row], axis=0)
+    once, twice = shell_of(room(SQUARE)), shell_of(room(doubled))
+    np.testing.assert_array_equal(twice.outline_m, once.outline_m)
+    assert list(twice.meshes()) == list(once.meshes())
+
+
 @pytest.mark.parametrize("outline", [SQUARE, L, SLANTED])
 def test_walls_stand_clear_of_furniture(outline):
     """A desk through the wall at +x: that wall alone moves, and its window with it."""

@@ -33,11 +33,15 @@ class ToySource:
     def survey(self) -> Survey:
         parts = run_tasks(_list, {"few": (0, 5), "others": (5, self.rooms)})
         ids = [room_id for part in parts for room_id in part]
+        lost = [ids[k] for k, trouble in self.trouble.items() if trouble == "survey"]
         tasks = (
             RoomTask(room_id, "box", "test" if k % 5 == 4 else "train", extra={"number": k})
             for k, room_id in enumerate(ids)
+            if room_id not in lost
         )
-        return Survey(tuple(tasks), (Line("box_x", "box", "filtered", "odd", "it is odd"),))
+        failed = (Line(room_id, "box", "failed", reason="it is cut") for room_id in lost)
+        odd = Line("box_x", "box", "filtered", "odd", "it is odd")
+        return Survey(tuple(tasks), (odd, *failed))
 
     def prepare(self, task: RoomTask, renderer: Any) -> PreparedRoom | Line:
         assert renderer is None
@@ -57,6 +61,10 @@ class ToySource:
                 return open("/nowhere/at/all")  # noqa: PTH123
             case "shapes":
                 return replace(made, views=replace(views, boxes=views.boxes[:1]))
+            case "intrinsics":
+                return replace(made, views=replace(views, intrinsics=views.intrinsics * np.nan))
+            case "centers_m":
+                return replace(made, truth=replace(truth, centers_m=truth.centers_m * np.nan))
         raise AssertionError
 
 

@@ -1,14 +1,16 @@
 """Ground truth of the shards as scenes, and the sets of rooms drawn from them."""
 
+import os
 import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from toy_rooms import write_shard
 
 from sceneprior.core.errors import ShardError
-from sceneprior.core.ground_truth import reference_scenes
+from sceneprior.core.ground_truth import read_model, reference_scenes
 from sceneprior.render.topdown import topdown
 
 
@@ -44,6 +46,15 @@ def test_a_mirrored_model_still_faces_outwards(shards, tmp_path, toy_room):
         volume = np.einsum("fi,fi->f", a, np.cross(b, c)).sum() / 6
         assert volume == pytest.approx(1.2 * 0.75 * 0.6, abs=1e-5)
     np.testing.assert_array_equal(topdown(plain), topdown(mirror))
+
+
+def test_a_model_that_changed_is_read_again(tmp_path):
+    path = tmp_path / "bed.ply"
+    for second, size in enumerate([(1.0, 2.0, 3.0), (4.0, 5.0, 6.0)]):
+        trimesh.creation.box(size).export(path)
+        os.utime(path, (second, second))
+        assert np.ptp(read_model(path).vertices_m, axis=0).tolist() == list(size)
+        assert read_model(path) is read_model(path)
 
 
 def test_missing_and_damaged_models_are_named(tmp_path, toy_room):

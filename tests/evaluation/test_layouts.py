@@ -98,6 +98,15 @@ def test_both_sides_weigh_alike_and_no_judged_room_is_learnt_from(rng, monkeypat
     assert len(np.unique(fresh, axis=0)) == 200, "each judged once"
 
 
+@pytest.mark.parametrize(("generated", "train"), [(1, 8), (0, 2), (0, 3)])
+def test_one_room_is_too_few_for_the_classifier(rng, generated, train):
+    """One generated room, and halves of two and three training rooms."""
+    real = [random_room(rng) for _ in range(train)]
+    rooms = room_set([random_room(rng) for _ in range(generated)] or real)
+    comparison = compared_with(room_set([random_room(rng)]), train=real)
+    assert layout_classifier_accuracy(rooms, comparison).value is None
+
+
 def piece(x: float, z: float, width: float, depth: float) -> SceneObject:
     return SceneObject("desk", (x, 0.5, z), (width, 1.0, depth))
 

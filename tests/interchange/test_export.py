@@ -1,5 +1,6 @@
 """Rooms go out in other formats and come back: axes, units, classes, floors."""
 
+import json
 import sys
 from dataclasses import replace
 
@@ -13,7 +14,7 @@ from data_prep.front.recipe import load_recipe
 from sceneprior.apps.rooms import write_scenes
 from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Mesh, Scene, SceneObject
-from sceneprior.interchange.box_lists import read_box_lists
+from sceneprior.interchange.box_lists import read_box_lists, turned_box
 from sceneprior.interchange.export import SIMULATORS, Notes, export_scenes
 from sceneprior.render.scene_files import load_scene_folder
 
@@ -93,6 +94,23 @@ def test_3d_front_s_reader_finds_the_rooms_and_their_models(scenes, tmp_path):
     # Without a floor, one is put under the furniture, and the room is about its centre.
     (other,) = read_house(tmp_path / "3D-FRONT" / "second.json", bank, recipe).rooms
     np.testing.assert_allclose(other.furniture[0].mesh.vertices_m.mean(0), (0, 2.2, 0), atol=1e-5)
+
+
+@pytest.mark.parametrize("yaw_rad", [np.pi / 2, np.pi, -2.1, 0.4])
+def test_3d_front_s_reader_finds_boxes_and_their_yaws(tmp_path, yaw_rad):
+    size = (1.6, 0.8, 2.0)
+    bed = turned_box("double_bed", np.array([0.3, 0.4, -0.2]), np.array(size), yaw_rad)
+    export_scenes([Scene("room", BEDROOM, (bed,), FLOOR)], "threed-front", tmp_path)
+    house, bank = tmp_path / "3D-FRONT" / "room.json", ModelBank(tmp_path / "3D-FUTURE-model")
+    (room,) = read_house(house, bank, load_recipe("bedroom")).rooms
+    (found,) = room.furniture
+    assert np.exp(1j * (found.yaw_rad - yaw_rad)) == pytest.approx(1, abs=1e-6)
+    low, high = (getattr(found.mesh.vertices_m, end)(axis=0) for end in ("min", "max"))
+    np.testing.assert_allclose((low + high) / 2, bed.center_m, atol=1e-5)
+    np.testing.assert_allclose(high - low, bed.size_m, atol=1e-5)
+    np.testing.assert_allclose(np.ptp(found.model.vertices_m, axis=0), size, atol=1e-5)
+    (told,) = json.loads(house.read_text())["furniture"]
+    assert told["size"] == [1.6, 2.0, 0.8]
 
 
 def test_what_cannot_be_exported_is_a_sentence(scenes, tmp_path, monkeypatch):

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 import shapely
 import trimesh
+from gltf import json_of
 from rooms_of_solids import solid_box
 
+from sceneprior.core.boxes import yaw_rotation
 from sceneprior.core.colliders import colliders, mass_kg, mesh_of
-from sceneprior.core.scene import Opening, Scene, SceneObject, Solid, Turned, bound_m
+from sceneprior.core.scene import Mesh, Opening, Scene, SceneObject, Solid, Turned, bound_m
 from sceneprior.interchange.export import export_scenes
 
 BEDROOM = "front3d_bedroom"
@@ -51,6 +53,19 @@ def test_mujoco_loads_a_room_with_walls_in_which_nothing_overlaps(scene, tmp_pat
         eye, north = np.array([x, 1.0, 1.0]), np.array([0.0, 1.0, 0.0])
         hit = mujoco.mj_ray(model, state, eye, north, None, 1, -1, np.zeros(1, np.int32))
         assert hit == pytest.approx(expected)
+
+
+def test_mujoco_loads_panes_and_crumbs(tmp_path):
+    """A mesh without volume, at an angle and lying, and a box that weighs less than a gram."""
+    mujoco = pytest.importorskip("mujoco", reason="no mujoco here: pip install -e '.[sim]'")
+    plane = trimesh.creation.box((0.4, 0.4, 0.4)).vertices * (1, 1, 0)
+    plane = plane @ yaw_rotation(0.5).T + (0, 0.2, 0)
+    mesh = Mesh(plane, trimesh.creation.box().faces)
+    pane = SceneObject("shelf", (0.0, 0.2, 0.0), tuple(np.ptp(plane, axis=0)), mesh)
+    crumb = solid_box("stool", (1.0, 0.005, 0.0), (0.01, 0.01, 0.01))
+    export_scenes([Scene("room", BEDROOM, (pane, crumb))], "mujoco", tmp_path)
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "room.xml"))
+    assert model.nbody == 1 + 2 and (model.body_mass[1:] > 0).all()
 
 
 def test_usd_of_simulators_has_bodies_and_passes_every_check(scene, tmp_path):
@@ -104,9 +119,11 @@ def test_habitat_gets_a_dataset_whose_files_are_all_there(scene, tmp_path):
             np.testing.assert_allclose(placed.extents, item.size_m, atol=1e-5)
     kinds = [entry["motion_type"] for entry in room["object_instances"]]
     assert kinds == ["DYNAMIC", "DYNAMIC", "STATIC", "DYNAMIC"]
-    # The turned bench is straight in its own frame.
-    own = trimesh.load_scene(tmp_path / "objects" / "room_3_stool.glb").extents
-    np.testing.assert_allclose(own, turned.size_m, atol=1e-5)
+    # The turned bench is straight in its own frame, and does not say that it is turned there.
+    path = tmp_path / "objects" / "room_3_stool.glb"
+    np.testing.assert_allclose(trimesh.load_scene(path).extents, turned.size_m, atol=1e-5)
+    (told,) = json_of(path.read_bytes())["scenes"][0]["extras"]["sceneprior"]["objects"]
+    assert told == {"node": "0_stool", "class": "stool"}
 
 
 def test_sceneeval_gets_a_scene_state_with_z_up(scene, tmp_path):

@@ -8,7 +8,9 @@ import torch
 from interrupting import CPU, interrupted
 from tiny_runs import tiny_config
 
+from sceneprior.core.errors import ConfigError
 from sceneprior.paper.stages import LayoutStage, ShapeStage
+from sceneprior.training import callbacks
 from sceneprior.training.fit import fit
 from sceneprior.training.method import read_checkpoint
 
@@ -69,3 +71,30 @@ def test_the_weights_of_the_lowest_loss_are_kept_over_a_stop(toy_shards, tmp_pat
         tiny_config(toy_shards, **few | {"layout__epochs": best + 1}), tmp_path / "plain"
     )
     assert all(torch.equal(kept[name], plain[name]) for name in plain)
+
+
+def test_a_run_stopped_between_two_checkpoints_keeps_the_lowest_loss_too(
+    toy_shards, tmp_path, monkeypatch
+):
+    few = {"layout__learning_rate": 0.3, "layout__epochs": 5, "shape__epochs": 1}
+    config, copies = tiny_config(toy_shards, **few, layout__keep="lowest"), []
+    whole, losses = trained(config, tmp_path / "whole")
+    falls = sum(loss < min(losses[:row], default=1e9) for row, loss in enumerate(losses))
+    copy = callbacks.copy_checkpoint
+
+    def stopped(*given):
+        copies.append(given)
+        if len(copies) == falls:
+            raise KeyboardInterrupt
+        copy(*given)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(callbacks, "copy_checkpoint", stopped)
+        fit(config, tmp_path / "run", trainer_options=CPU)
+    kept, _ = trained(config, tmp_path / "run")
+    assert all(torch.equal(kept[name], whole[name]) for name in whole)
+
+
+def test_epochs_of_the_latents_alone_are_part_of_the_stages(tmp_path):
+    with pytest.raises(ConfigError, match="latent_epochs is 9"):
+        tiny_config(tmp_path, layout__latent_epochs=9, layout__epochs=2)

@@ -12,6 +12,7 @@ from sceneprior.render.topdown import (
     WALL,
     WINDOW,
     floor_plan,
+    html_of,
     perspective,
     topdown,
 )
@@ -59,3 +60,9 @@ def test_ids_have_their_colours_and_dark_borders():
     picture = paint_ids(ids, np.array([[100, 0, 0], [0, 60, 0]]), (9, 9, 9))
     assert picture[0].tolist() == [[9, 9, 9], [9, 9, 9], [50, 0, 0], [100, 0, 0]]
     assert picture[2].tolist() == [[0, 30, 0]] * 4
+
+
+def test_notebooks_show_class_names_as_they_are():
+    bed = SceneObject("<i>bed & co", (0.0, 0.5, 0.0), (1.0, 1.0, 1.0))
+    shown = html_of(Scene("a<b", "void,<i>bed & co", (bed,)))
+    assert "<figcaption>a&lt;b: &lt;i&gt;bed &amp; co</figcaption>" in shown

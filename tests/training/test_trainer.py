@@ -19,6 +19,7 @@ from sceneprior.training.trainer import make_logger
 REFUSED = {
     "unknown argument": ({"trainer": {"max_step": 3}}, {}),
     "16-mixed": ({}, {"precision": "16-mixed"}),
+    "64-true": ({}, {"precision": "64-true"}),
     "no such callback": ({"callbacks": [{"lightning.pytorch.callbacks.Stopping": None}]}, {}),
     "no callback": ({"callbacks": [{"pathlib.Path": None}]}, {}),
     "callback's argument": (

@@ -146,6 +146,12 @@ def straighten(lens: Lens, intrinsics: np.ndarray, size: tuple[int, int]) -> Str
     K = np.asarray(intrinsics, dtype=np.float64)
     focal, center = np.diag(K)[:2], K[:2, 2]
     sides = np.array([width, height], dtype=np.float64)
+    if not ((center > 0) & (center < sides)).all():
+        x, y = center
+        raise InputError(
+            f"its principal point ({x:g}, {y:g}) lies outside the picture of {width} x {height} "
+            "pixels; give w and h of the pictures that cx and cy belong to"
+        )
     # A grid of points over the whole picture, its border included.
     grid = np.stack(np.meshgrid(*(np.linspace(0, side, _GRID) for side in sides)), axis=-1)
     wanted = (grid.reshape(-1, 2) - center) / focal

@@ -24,7 +24,7 @@ from data_prep.readers.posed.masks import (
 from data_prep.readers.posed.recording import INSTANCES
 from sceneprior.core.checked import checked, shown
 from sceneprior.core.classes import STUFF, label_set
-from sceneprior.core.coco import CROWD, Category, CocoId, Side, read_coco_json
+from sceneprior.core.coco import CROWD, Category, CocoId, Side, check_ids, read_coco_json
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import list_files, read_json
 from sceneprior.core.id_tables import LARGEST_ID, mask_size, read_rgb, stuff_of, tidy
@@ -94,6 +94,7 @@ class _Images(BaseModel):
 
     def masks(self, path: Path) -> Iterator[tuple[int, int, Any, str]]:
         """Index of the annotation, index of the picture, segmentation, and place of each mask."""
+        check_ids(path, "image", [(image.id, image.file_name) for image in self.images])
         place_of = {image.id: place for place, image in enumerate(self.images)}
         for k, row in enumerate(self.annotations):
             where = f"annotation {shown(row.id)}"
@@ -180,6 +181,7 @@ class CocoMasks(MaskFormat):
     @cached_property
     def frames(self) -> dict[str, FrameMask]:
         coco, (path,) = self._content, self.find(self.folder)
+        check_ids(path, "category", [(row.id, row.name) for row in coco.categories])
         names = {row.id: row.name for row in coco.categories}
         for row in coco.annotations:
             if row.category_id not in names:
@@ -249,21 +251,36 @@ class PanopticPngs(FramePngs):
         return FrameMask(
             partial(mask_size, path, rgb=True),
             partial(self._read, path),
-            lambda: self._segments[1].get(path.stem, {}),
+            lambda: self._segments[1].get(self._name_of(path), {}),
         )
+
+    def _name_of(self, path: Path) -> str:
+        """The name of a PNG's frame in the JSON, which may leave out folders."""
+        place, named = self.folder / INSTANCES, self._segments[1]
+        whole = _without_suffix(path.relative_to(place) if place in path.parents else path)
+        if whole in named:
+            return whole
+        fits = [
+            name
+            for name in named
+            if f"/{whole}".endswith(f"/{name}") or f"/{name}".endswith(f"/{whole}")
+        ]
+        stems = [name for name in named if Path(name).name == path.stem]
+        return max(fits, key=len) if fits else stems[0] if len(stems) == 1 else ""
 
     @cached_property
     def _segments(self) -> tuple[np.ndarray, dict[str, dict[int, str]], set[str]]:
         """Segment ids, (n,), ascending; the class by new id, k + 1 for the k-th segment, for each
-        frame, by the stem of its PNG; and the classes of stuff that the label set does not have,
+        frame, by the name of its PNG; and the classes of stuff that the label set does not have,
         "background" included, which are no objects."""
         path = find_table(self.folder)
         room = checked(_Panoptic, read_json(path), str(path))
+        check_ids(path, "category", [(item.id, item.name) for item in room.categories])
         own = {tidy(name) for name in label_set(self.label_set_name)}
         stuff = {_BACKGROUND, *STUFF[1:]} - own
         names = {}
         for item in room.categories:
-            if item.isthing or tidy(item.name) in own:
+            if item.isthing or tidy(self.mapped(item.name)) in own:
                 names[item.id] = item.name
             else:
                 name = STUFF[stuff_of(item.name)]
@@ -277,7 +294,8 @@ class PanopticPngs(FramePngs):
                         f"{segment.id} is not among its categories."
                     )
                 name = CROWD if segment.iscrowd else names[segment.category_id]
-                by_frame.setdefault(Path(frame.file_name).stem, {})[segment.id] = name
+                of_name = by_frame.setdefault(_without_suffix(Path(frame.file_name)), {})
+                of_name[segment.id] = name
         ids = sorted({k for classes in by_frame.values() for k in classes} - {0})
         if not 0 < len(ids) < LARGEST_ID:
             raise InputError(f"{path} has {len(ids)} segments; expected 1 to {LARGEST_ID - 1}.")
@@ -313,7 +331,7 @@ class PanopticPngs(FramePngs):
                 before, where = first.setdefault(number, (name, stem))
                 if before != name and {before, name} <= stuff:
                     first[number] = _BACKGROUND, where
-                elif before != name:
+                elif self.mapped(before) != self.mapped(name):
                     raise InputError(
                         f"{self.folder / PANOPTIC}: segment {ids[number - 1]} is {before} in "
                         f"'{where}', but {name} in '{stem}'. Ids must be tracked: the same object "
@@ -321,3 +339,7 @@ class PanopticPngs(FramePngs):
                         "--tracks auto."
                     )
         return {number: name for number, (name, _) in first.items()}
+
+
+def _without_suffix(path: Path) -> str:
+    return path.with_suffix("").as_posix() if path.name else ""

@@ -1,5 +1,6 @@
 """Parses `--from` and `--label-set`; guesses the tools that wrote a room's poses and masks."""
 
+import contextlib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -95,11 +96,14 @@ def read_label_set(text: str) -> str:
     contain `void`; lines that begin with # are skipped.
     """
     path = Path(text)
-    if not path.is_file():
+    if text.startswith("void,"):
+        return label_set_name([name.strip() for name in text.split(",")[1:]])
+    is_file = False
+    with contextlib.suppress(OSError):  # the name is too long
+        is_file = path.is_file()
+    if not is_file:
         if text in LABEL_SETS:
             return text
-        if text.startswith("void,"):
-            return label_set_name([name.strip() for name in text.split(",")[1:]])
         raise InputError(
             f"--label-set {text} is neither a file with one class per line, nor one of "
             f"{', '.join(LABEL_SETS)}, nor a list such as void,bed,chair."

@@ -113,8 +113,15 @@ class MaskFormat(ABC):
 
     def table(self, of_id: dict[int, str]) -> IdTable:
         """The table of ids whose names are given, mapped to classes."""
-        named = {key: self.class_map.get(tidy(name), name) for key, name in of_id.items()}
-        return IdTable(named, self.label_set_name, str(self.folder))
+        return IdTable(
+            {key: self.mapped(name) for key, name in of_id.items()},
+            self.label_set_name,
+            str(self.folder),
+        )
+
+    def mapped(self, name: str) -> str:
+        """The class of a name of the masks."""
+        return self.class_map.get(tidy(name), name)
 
     def wanted(self, frame: PosedFrame) -> str:
         """Description, for messages, of the expected file of a frame's masks, and of what exists
@@ -127,10 +134,29 @@ class MaskFormat(ABC):
 
     def classes(self) -> dict[int, str]:
         """Class of each id, if ids are the same in all frames."""
-        classes, self.notes = main_classes(
-            (frame.classes() for frame in self.frames.values()), self.label_set_name
-        )
-        return classes
+        return self.main_classes(frame.classes() for frame in self.frames.values())
+
+    def main_classes(self, of_frames: Iterable[dict[int, str]]) -> dict[int, str]:
+        """The most frequent class of each id over all frames, one of the label set if several are,
+        under one of its names; `notes` has one on ids with several classes."""
+        votes: dict[int, Counter[str]] = {}
+        names: dict[str, str] = {}
+        for classes in of_frames:
+            for number, name in classes.items():
+                names.setdefault(self.mapped(name), name)
+                votes.setdefault(number, Counter())[self.mapped(name)] += 1
+        changing = [
+            f"{number} ({', '.join(f'{plain(name)} {k}' for name, k in count.most_common())})"
+            for number, count in sorted(votes.items())
+            if len(count) > 1
+        ]
+        note = f"ids with several classes take the most frequent one: {_some(changing)}"
+        self.notes = [note] if changing else []
+        own = {tidy(name) for name in label_set(self.label_set_name)}
+        return {
+            number: names[max(count, key=lambda name: (count[name], tidy(name) in own))]
+            for number, count in sorted(votes.items())
+        }
 
 
 class FramePngs(MaskFormat):
@@ -166,29 +192,6 @@ def find_table(folder: Path) -> Path:
         named = " and ".join(path.name for path in found) or f"no {' or '.join(TABLES)}"
         raise InputError(f"{folder} has {named}; expected one table with the class of each id.")
     return found[0]
-
-
-def main_classes(
-    of_frames: Iterable[dict[int, str]], label_set_name: str
-) -> tuple[dict[int, str], list[str]]:
-    """The most frequent class of each id over all frames, one of the label set if several are, and
-    a note on ids with several classes."""
-    votes: dict[int, Counter[str]] = {}
-    for classes in of_frames:
-        for number, name in classes.items():
-            votes.setdefault(number, Counter())[name] += 1
-    changing = [
-        f"{number} ({', '.join(f'{plain(name)} {k}' for name, k in count.most_common())})"
-        for number, count in sorted(votes.items())
-        if len(count) > 1
-    ]
-    notes = [f"ids with several classes take the most frequent one: {_some(changing)}"]
-    own = {tidy(name) for name in label_set(label_set_name)}
-    most = {
-        number: max(count, key=lambda name: (count[name], tidy(name) in own))
-        for number, count in sorted(votes.items())
-    }
-    return most, notes if changing else []
 
 
 def instead(names: Iterable[str]) -> str:

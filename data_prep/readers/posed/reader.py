@@ -1,16 +1,18 @@
 """Reads the user's own posed pictures with masks (docs/posed_data.md): a folder is a room."""
 
 import contextlib
+import hashlib
 import math
+import os
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
-from data_prep.engine.plan import digest, digest_of_files, seeded_split
+from data_prep.engine.plan import digest, seeded_split
 from data_prep.engine.source import Line, RoomTask
 from data_prep.readers.frames import choose_frames, room_cameras, shrunk
 from data_prep.readers.posed.formats import mask_files, mask_format
@@ -36,7 +38,7 @@ from data_prep.readers.reader import FoundRoom, Reader
 from data_prep.readers.rooms import FramedRoom
 from sceneprior.core.classes import label_set
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import list_folders
+from sceneprior.core.files import check_file, list_folders
 
 TRACKS = ("given", "auto")
 
@@ -106,18 +108,26 @@ class Posed(Reader):
         return {"from": formats, **{name: getattr(self, name) for name in names}, **mapped}
 
     def fingerprint(self, scenes: list[str]) -> dict[str, Any]:
-        """See `Reader.fingerprint`: names and sizes of files are part of it, so that shards of
-        older masks or classes are not reused."""
+        """See `Reader.fingerprint`: the contents of files are part of it, so that shards of older
+        masks or classes are not reused."""
         files = {
-            name: digest_of_files(
-                pose_files(room, self.poses)[1]
-                + [room / table for table in TABLES if (room / table).is_file()]
-                + mask_files(room)
-            )
+            (name, Path(os.path.relpath(path, room)).as_posix()): _content(path)
             for name, room in self._folders().items()
             if name in scenes
+            for path in [
+                *pose_files(room, self.poses)[1],
+                *(room / table for table in TABLES if (room / table).is_file()),
+                *mask_files(room),
+                *self._files_of_frames(room),
+            ]
         }
         return {"test_share": self.test_share, "rooms": digest(repr(sorted(files.items())))}
+
+    def _files_of_frames(self, room: Path) -> Iterator[Path]:
+        """Masks that the file of poses names, which may lie anywhere."""
+        with contextlib.suppress(InputError):  # the report will have the error
+            for frame in read_recording(room, self.poses, self.model).frames:
+                yield from (path for path in (frame.instances, frame.known) if path)
 
     def scenes(self) -> list[str]:
         return [*self._folders()]
@@ -273,10 +283,20 @@ def masks_of_frames(recording: Recording, masks: MaskFormat) -> dict[int, FrameM
     return of_frames
 
 
+def _content(path: Path) -> str:
+    """Hash of a file, or why it cannot be read."""
+    try:
+        check_file(path)
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except (InputError, OSError) as error:
+        return str(error)
+
+
 def find_rooms(folder: Path, poses: str | None = None) -> list[Path]:
     """Find rooms: the folder itself if it holds poses (`pose_files`), else its sub-folders, sorted.
 
-    Sub-folders with `instances/` but no poses are included, so that the report mentions them.
+    Sub-folders with masks but no poses are included, so that the report mentions them.
     """
     if not folder.is_dir():
         raise InputError(
@@ -285,11 +305,10 @@ def find_rooms(folder: Path, poses: str | None = None) -> list[Path]:
         )
     if pose_files(folder, poses)[1]:
         return [folder]
-    found = [
-        path
-        for path in list_folders(folder)
-        if (pose_files(path, poses)[1] or (path / INSTANCES).is_dir())
-    ]
+    own = list_folders(folder)
+    found = [path for path in own if pose_files(path, poses)[1] or (path / INSTANCES).is_dir()]
+    if found:  # otherwise those with masks are parts of a room without poses
+        found = [path for path in own if path in found or mask_files(path)]
     if not found:
         tools = POSES.values() if poses is None else [POSES[poses]]
         raise InputError(

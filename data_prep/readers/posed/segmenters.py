@@ -22,7 +22,6 @@ from data_prep.readers.posed.masks import (
     SegmentedFrame,
     find_table,
     instead,
-    main_classes,
 )
 from data_prep.readers.posed.recording import INSTANCES, PosedFrame
 from sceneprior.core.checked import checked, plain
@@ -205,7 +204,7 @@ class GroundedSam2(MaskFormat):
 
     def classes(self) -> dict[int, str]:
         paths = list_files(self.folder / LABELS, f"{PREFIX}*.json")
-        classes, self.notes = main_classes(map(_labels, paths), self.label_set_name)
+        classes = self.main_classes(map(_labels, paths))
         if not classes:
             raise InputError(
                 f"{self.folder / LABELS} names no class; expected {PREFIX}<frame>.json for each "

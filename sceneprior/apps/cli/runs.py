@@ -42,8 +42,9 @@ def fit(
 ) -> None:
     """Train the stages of a run, one after the other."""
     from sceneprior.apps.config import load_config
+    from sceneprior.core.settings import as_value
 
-    changed = [*(set_ or ()), *([f"init_from={init_from}"] if init_from else ())]
+    changed = [*(set_ or ()), *([f"init_from={as_value(str(init_from))}"] if init_from else ())]
     settings = load_config(config, tuple(changed))  # before imports that take seconds
     folder = run or Path("runs") / Path(config).stem
     from sceneprior.training.fit import fit as run_fit
@@ -116,10 +117,10 @@ def compare(
     apart.
     """
     if sources:
-        if (config, methods, rooms, seeds) != (TABLES, None, None, None):
+        if (config, methods, rooms, seeds, accelerator) != (TABLES, None, None, None, None):
             raise InputError(
-                "--config, --methods, --rooms and --seeds are for comparisons that train; leave "
-                "them out, or name no SOURCES."
+                "--config, --methods, --rooms, --seeds and --accelerator are for comparisons that "
+                "train; leave them out, or name no SOURCES."
             )
         from sceneprior.apps.experiments.sources import compare_sources
         from sceneprior.evaluation.synthesis import EvalOptions
@@ -279,16 +280,16 @@ def export(
 
     check_free(out, overwrite)
     left_out: Sequence[str] = ()
+    asked = None if shell is None else options.checked_shell(shell)
     if to == "scenes":
         if label_set is None:
             raise InputError("--to scenes needs --label-set, the label set of the box lists.")
         rooms = read_box_lists(source, label_set, classes, sizes or "half")
-        write_scenes(rooms, out)
+        write_scenes(rooms, out, "none" if asked is None else asked)
     else:
         if (label_set, classes, sizes) != (None, None, None):
             raise InputError("--label-set, --classes and --sizes apply only with --to scenes.")
         rooms = load_scene_folder(source, with_materials=True)
-        asked = None if shell is None else options.checked_shell(shell)
         notes = export_scenes(rooms, to, out, asked)
         left_out = notes.left_out
         for note in (*notes.changed, *left_out):

@@ -27,6 +27,7 @@ from sceneprior.apps.config import load_config
 from sceneprior.core.checked import checked
 from sceneprior.core.errors import InputError, sentence_of
 from sceneprior.core.files import only_writer, read_json, write_json
+from sceneprior.core.settings import as_value
 
 Main = Callable[[list[str]], int | None]
 """The command line: runs a command in this process; returns its exit status."""
@@ -210,7 +211,8 @@ def demo_commands(out: Path, config: str, rooms: int, count: int) -> list[Comman
             "--out", shards,
         ],
         "fit": [
-            "fit", "--config", config, "--run", run, "--set", f"data.shards={shards}", "--resume",
+            "fit", "--config", config, "--run", run, "--set",
+            f"data.shards={as_value(shards)}", "--resume",
         ],
         "scenes": ["synthesize", "--run", run, "-n", "16", "--out", scenes, "--overwrite"],
         "scores": ["eval-fid", "--run", run, "-n", str(count), "--out", scores],

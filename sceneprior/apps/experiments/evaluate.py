@@ -90,6 +90,8 @@ def evaluate_run(
     if isinstance(trained, TrainedPrior):
         latents = marked(distribution or trained.distribution)
     scores["protocol"] |= {"run": Path(run).name, "stage": trained.stage, "latents": latents}
+    if asked:
+        scores["protocol"]["request"] = asked
     return scores
 
 

@@ -205,9 +205,8 @@ def _say_rooms(scores: Result) -> str:
     generated = f"{protocol['n_generated']} generated rooms per run"
     if "shards" not in protocol:
         return f"{generated}, compared with no real rooms"
-    return (
-        f"{generated} against {protocol['n_test']} test rooms of {protocol['shards']}; "
-        f"{protocol['n_train_rooms']} real training rooms"
+    return f"{generated} against {protocol['n_test']} test rooms of {protocol['shards']}" + (
+        f"; {count} real training rooms" if (count := protocol.get("n_train_rooms")) else ""
     )
 
 

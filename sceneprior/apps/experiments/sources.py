@@ -27,6 +27,7 @@ SHARED = {
     "n_train_rooms_available": "training rooms", "n_train_rooms": "training rooms compared",
     "n_pictured": "rooms compared by pictures", "render": "rendering", "networks": "networks",
     "renders": "pictures of test rooms", "stand": "--stand", "version": "version of the result",
+    "request": "requested rooms",
 }  # fmt: skip
 """Entries of a protocol that results share if they can be compared, with their names."""
 _SHORT = 40

@@ -16,7 +16,7 @@ from sceneprior.core.coco import read_coco
 from sceneprior.core.errors import InputError
 from sceneprior.core.files import read_json
 from sceneprior.core.id_tables import IdTable, read_class_table, read_mask, tidy
-from sceneprior.core.observations import observe, thinned
+from sceneprior.core.observations import observe, thinned, thinned_intrinsics
 from sceneprior.core.views import ObservedImage
 
 SAME_CLASS = {
@@ -91,8 +91,7 @@ def read_own_image(
     camera = read_intrinsics(intrinsics, values.shape)
     step = -(-max(values.shape) // LARGEST_PX)
     seen = observe(table.ids(values[thinned(step)])[None], table.classes)
-    height, width = seen.instance_ids.shape[1:]
-    camera = np.diag([width / values.shape[1], height / values.shape[0], 1]) @ camera
+    camera = thinned_intrinsics(camera, step)
     if not len(seen.tracked):
         raise InputError(
             f"{mask} shows no object: none of its masks is wider than 4 pixels and has a class of "

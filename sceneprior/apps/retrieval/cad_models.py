@@ -11,6 +11,7 @@ model's file changes. The package's own furniture (`sceneprior/furniture`) is bu
 first needs its class, in 10 to 100 ms.
 """
 
+import contextlib
 import hashlib
 import os
 import warnings
@@ -313,7 +314,7 @@ def _points_of_models(
         try:
             if not all(map(is_name, model_id.split("/"))):
                 raise InputError(f"{ascii(model_id)[:60]} cannot be a folder's name")
-            keys[model_id] = f"{model_id} {file_stamp(files.path_of(model_id))}"
+            keys[model_id] = _key_of(model_id, files)
         except InputError as error:
             broken[model_id] = str(error)
     points = {key: before[key] for key in keys.values() if key in before}
@@ -327,9 +328,22 @@ def _points_of_models(
                 broken[model_id] = str(error)
     finally:
         if points.keys() - before.keys():
-            stacked = np.stack(list(points.values()))
-            keep_arrays(kept, {"keys": np.array(list(points)), "points": stacked})
+            # Models of other label sets stay, too, as long as their files are the same.
+            every = {key: own for key, own in before.items() if _is_current(key, files)} | points
+            stacked = np.stack(list(every.values()))
+            keep_arrays(kept, {"keys": np.array(list(every)), "points": stacked})
     return {m: points[key] for m, key in keys.items() if key in points}, broken
+
+
+def _key_of(model_id: str, files: _ModelFiles) -> str:
+    """A model and the version of its file."""
+    return f"{model_id} {file_stamp(files.path_of(model_id))}"
+
+
+def _is_current(key: str, files: _ModelFiles) -> bool:
+    with contextlib.suppress(InputError):
+        return _key_of(key.rpartition(" (")[0], files) == key
+    return False
 
 
 def _unit_samples(mesh: Mesh) -> Float[np.ndarray, "points 3"]:

@@ -26,7 +26,7 @@ from sceneprior.core.boxes import QUARTERS, quarter_rotation
 from sceneprior.core.parallel import map_blocks
 from sceneprior.core.repeatable import single_threaded
 from sceneprior.core.scene import Mesh, Scene, SceneObject, quarter_turned
-from sceneprior.core.surfaces import chamfer_mean, surface_points
+from sceneprior.core.surfaces import chamfer_of, nearest_distances, surface_points
 from sceneprior.render.appearance import box_mesh
 from sceneprior.render.silhouettes.cpu.kernels import thread_count
 
@@ -52,7 +52,7 @@ class Retrieved(NamedTuple):
     turn_deg: int
     """The yaw of the model in the room: 0, 90, 180 or 270 (docs/conventions.md)."""
     distance_m: float
-    """Chamfer distance between the object and the model in metres, by `chamfer_mean`."""
+    """Chamfer distance between the object and the model in metres, the mean of both directions."""
 
 
 def retrieve(
@@ -66,12 +66,13 @@ def retrieve(
     without models; such an object keeps its mesh, extruded together with its box.
 
     Args:
-        keep: Indices of objects that stay as they are; their entries are None.
+        keep: Indices of objects that stay as they are, with the entries that they have.
         alike: Objects of a class whose sizes are similar (`ALIKE`) get the model of the first of
             them, so that two nightstands, or the chairs of a table, are of one kind.
     """
     objects: list[SceneObject] = []
     found: list[dict[str, Any] | None] = []
+    before = scene.extra.get("retrieval", [])
     for row, item in enumerate(scene.objects):
         box, told = item if row in keep else extruded(item), None
         if row not in keep and (of_class := models.of_class(item.label)):
@@ -87,7 +88,10 @@ def retrieve(
             objects.append(replace(box, mesh=mesh, turned=turned, solids=(), textured=textured))
             told = best._asdict() | {"distance_m": round(best.distance_m, 5)}
         else:
-            objects.append(item if box is item else item.in_box(box.center_m, box.size_m))
+            if box is not item:
+                item = replace(item.in_box(box.center_m, box.size_m), turned=box.turned)
+            objects.append(item)
+            told = before[row] if row in keep and row < len(before) else None
         found.append(told)
     return replace(scene, objects=tuple(objects), extra={**scene.extra, "retrieval": found})
 
@@ -202,7 +206,8 @@ def most_similar(item: SceneObject, models: ClassModels) -> Retrieved:
     for choice in choices:
         model, turn = divmod(int(choice), QUARTERS)
         points, size = views[turn]
-        distances.append(chamfer_mean(points, models.points[model] * size, trees[turn]))
+        apart = nearest_distances(points, models.points[model] * size, trees[turn])
+        distances.append(chamfer_of(*apart).l2_m / 2)
     best = int(np.argmin(distances))
     model, turn = divmod(int(choices[best]), QUARTERS)
     return Retrieved(models.model_ids[model], 90 * turn, distances[best])
@@ -232,7 +237,7 @@ def _rough_distances(
     choices: Int[np.ndarray, " choices"],
     step: int,
 ) -> Float[np.ndarray, " choices"]:
-    """`chamfer_mean` over every `step`-th point, for preselection."""
+    """The distance over every `step`-th point, for preselection."""
     rough = np.empty(len(choices), dtype=np.float32)
     few = models[:, ::step]
     for turn, (points, size) in enumerate(views):

@@ -8,7 +8,7 @@ from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch import Tensor
 
 from sceneprior.baselines.one_stage import OneStage
@@ -69,6 +69,15 @@ class UslConfig(SingleViewConfig):
     method: Literal["usl"] = "usl"
     model: UslModel = UslModel()
     training: UslTraining = UslTraining()
+
+    @model_validator(mode="after")
+    def _compares_views(self) -> "UslConfig":
+        if self.data.views_per_room < 2:
+            raise ValueError(
+                "data.views_per_room is 1, but method: usl learns from pairs of views of a room; "
+                "set it to 2 or more"
+            )
+        return self
 
     def make(self) -> "UslStage":
         return UslStage(Usl(self.model, self.classes), self)
@@ -136,7 +145,7 @@ class UslStage(OneStage):
                 vertices_m,
                 self.prior.shape.faces,
                 others.world_to_camera,
-                others.intrinsics_at(height, width),
+                others.mask_intrinsics(),
                 (height, width),
                 mode=self.settings.silhouettes,
                 compositing="alone",

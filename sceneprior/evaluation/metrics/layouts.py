@@ -144,6 +144,8 @@ def layout_classifier_accuracy(rooms: RoomSet, comparison: Comparison) -> Estima
         scenes, real = ([real[row] for row in half] for half in halves)
         counts = resample_counts(len(scenes), len(counts) - 1, (comparison.seed, 4))
     test, seed = comparison.test, comparison.seed
+    if min(len(scenes), len(real)) < 2:
+        return Estimate(np.full(len(counts), np.nan))
     generated = jittered_features(scenes, (seed, 0))
     judged = jittered_features(test.scenes, (seed, 1))
     learnt = jittered_features(real, (seed, 2))

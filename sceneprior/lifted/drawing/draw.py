@@ -151,16 +151,15 @@ def _furnish(
         The particles; the best one of each room, or -1 if the room is to be furnished again; and
         the classes of required objects that were left out.
     """
-    rules = None
+    rules, particles = None, Particles(sampler, plans, effort.particles)
     if conditions.has_rules:
-        given = [furniture_in(sampler, plans.rooms, room) for room in range(len(draws))]
+        given = particles.furniture()[:: effort.particles]
         relations = conditions.wishes.relations
-        rules = [
+        rules = particles.rules = [
             PlacementRules(shape, relations, conditions.classes, own, number < effort.comfortable)
             for shape, own in zip(plans.shapes, given, strict=True)
             if shape is not None
         ]
-    particles = Particles(sampler, plans, effort.particles, rules)
     shape = (sampler.max_objects, effort.particles, NUMBERS)
     numbers = torch.from_numpy(np.stack([own.random(shape) for own in draws])).float()
     failed: set[int] = set()
@@ -243,7 +242,7 @@ def sample_scenes(
         request = request or RoomRequest()
         whole = Counter(classes) + Counter(item.label for item in request.objects)
         want = {label: whole[label] for label in known}
-        request = RoomRequest(**{**request.parts(), "want": want})
+        request = RoomRequest.of(**{**request.parts(), "want": want})
     conditions, told = Conditions(tuple(label_names)), dict[str, Any]()
     if request is not None:
         labels, most = trained.config.label_set, sampler.max_objects
@@ -299,15 +298,14 @@ def _scene_of(
     assert sampler is not None and rooms.looks is not None and rooms.rectangle_m is not None
     fronts = side_of(rooms.looks[row], sampler.fronts)
     confidence = sampler.front_confidence[rooms.looks[row] // POSES]
+    known = sampler.is_known(rooms)[row]  # others get no mesh
     objects = []
     for item in rooms.is_object[row].nonzero()[:, 0].tolist():
         box = rooms.boxes_m[row, item].double().numpy()
         look, index = int(rooms.looks[row, item]), int(rooms.object_class[row, item])
-        # A given object whose class has no prototype gets no mesh.
-        known = int(sampler.look_class[look]) == index
-        if box[1] - box[4] / 2 < HANGS_M:
+        if item >= len(conditions.objects) and box[1] - box[4] / 2 < HANGS_M:
             box[1] = box[4] / 2  # lifted boxes end a little above the floor
-        mesh, solids = _shape_in(shapes, look, box) if known else (None, ())
+        mesh, solids = _shape_in(shapes, look, box) if known[item] else (None, ())
         center, size = tuple(box[:3]), tuple(box[3:])
         # A front at high z, high x, low z or low x is turned by 0, 1, 2 or 3 quarters.
         turned = quarter_turned(size, int(fronts[item]) + 2)._replace(

@@ -3,6 +3,7 @@ effort to furnish them."""
 
 import warnings
 from collections.abc import Sequence
+from itertools import takewhile
 from typing import NamedTuple
 
 import numpy as np
@@ -35,6 +36,9 @@ FULL_SHARE = 0.5
 CROWDED_SHARE = 1.2
 """Share of a requested floor above which the smallest footprints of required objects are assumed
 not to fit. It is above 1, because some objects may overlap, such as a chair and a table."""
+OPENING_TRIES = 400
+"""Draws of the places of doors and windows on a requested floor, one of which must find them all.
+They are the same for every seed and number of rooms, and the first one nearly always does."""
 UNUSUAL = 0.001
 """Probability of drawing a smaller or larger floor below which a requested floor is unusual."""
 LOOKS = 16
@@ -152,9 +156,6 @@ def plan_rooms(
             if shape is None or not shape.lacks:
                 break
         shapes.append(shape)
-    lacks = [shape.lacks for shape in shapes if shape]
-    if floor is not None and lacks and all(lacks):
-        raise InputError(lacks[0])
     counts = sampler.counts(known)[0]
     counts = (counts + F.one_hot(required, len(counts)).sum(dim=0)).expand(count, -1)
     free = slots - int(counts[0].sum())
@@ -288,11 +289,18 @@ def check_floor(sampler: RoomSampler, conditions: Conditions, may_lack: bool) ->
         may_lack: Required objects may be missing.
 
     Raises:
-        InputError: the required objects at their smallest cover `CROWDED_SHARE` of the floor.
+        InputError: the required objects at their smallest cover `CROWDED_SHARE` of the floor, or
+            none of `OPENING_TRIES` draws finds places for the doors and windows.
     """
-    if conditions.floor is None:
+    floor = conditions.floor
+    if floor is None:
         return
-    area_m2, least_m2 = conditions.floor.polygon.area, 0.0
+    tries = map(np.random.default_rng, range(OPENING_TRIES))
+    shapes = (_shape(conditions, floor.rectangle_m, draws) for draws in tries)
+    lacks = [*takewhile(bool, (shape.lacks for shape in shapes if shape))]
+    if len(lacks) == OPENING_TRIES:
+        raise InputError(lacks[0])
+    area_m2, least_m2 = floor.polygon.area, 0.0
     for index in conditions.required:
         sizes = sampler.look_shown[sampler.look_class == index, -3:].exp()
         on_floor = sizes[:, [0, 2]].prod(dim=-1)

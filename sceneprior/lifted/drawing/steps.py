@@ -49,17 +49,13 @@ class Particles:
     Args:
         plans: The rooms' plans; all particles start with the given objects.
         each: Number of particles of a room.
-        rules: Placement rules of each room, if the rooms have any.
     """
 
-    def __init__(
-        self,
-        sampler: RoomSampler,
-        plans: RoomPlans,
-        each: int,
-        rules: Sequence[PlacementRules] | None,
-    ):
-        self.sampler, self.plans, self.each, self.rules = sampler, plans, each, rules
+    rules: Sequence[PlacementRules] | None = None
+    """Placement rules of each room, if the rooms have any."""
+
+    def __init__(self, sampler: RoomSampler, plans: RoomPlans, each: int):
+        self.sampler, self.plans, self.each = sampler, plans, each
         self.room = torch.arange(len(plans.shapes)).repeat_interleave(each)
         self.rooms = plans.rooms.changed(lambda part: part[self.room])
         assert self.rooms.looks is not None

@@ -17,7 +17,7 @@ from sceneprior.core.scene import Opening, Scene, SceneObject
 from sceneprior.core.scene_json import WALL_M
 from sceneprior.core.shell import floor_polygon
 from sceneprior.lifted.requests.floors import Floor, RoomShape
-from sceneprior.lifted.requests.openings import WantedOpening, walls_for
+from sceneprior.lifted.requests.openings import USUAL_M, WantedOpening, walls_for
 from sceneprior.lifted.requests.relations import Furniture, RelationChecks, footprints
 from sceneprior.lifted.requests.wishes import OPENINGS, Conditions, CountWish
 
@@ -96,7 +96,10 @@ def _check_places(
         floor = f"a floor from {low_x:g} to {high_x:g} m in x and {low_z:g} to {high_z:g} m in z"
         for text, plan in zip(said, footprints(boxes_of(asked.objects)), strict=False):
             _compare(plan.difference(asked.floor.polygon).area / plan.area, "outside", text, floor)
-    for text, top_m in zip(said, high_m[:, 1], strict=True):
+    tops_m = [*zip(said, high_m[:, 1], strict=True)]
+    wanted = [each for each in asked.openings if isinstance(each, WantedOpening)]
+    tops_m += [(f"a {each.kind}", USUAL_M[each.kind][2]) for each in wanted]
+    for text, top_m in tops_m:
         if top_m > (asked.ceiling_m or math.inf) + WALL_M:
             raise _contradiction(
                 f"{text}, which is {top_m:g} m high", f"a ceiling of {asked.ceiling_m:g} m"

@@ -123,8 +123,7 @@ def read_floor(floor: Any) -> np.ndarray:
             f"The floor is {width_m:g} x {depth_m:g} m large; expected at most {LONGEST_M:g} m. "
             f"{unit_guess(longest_m)}"
         )
-    if (outline_m[0] == outline_m[-1]).all():
-        outline_m = outline_m[:-1]
+    outline_m = outline_m[(outline_m != np.roll(outline_m, -1, axis=0)).any(axis=1)]
     polygon = shapely.Polygon(outline_m)
     if not polygon.is_valid:
         raise InputError(

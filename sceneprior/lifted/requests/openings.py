@@ -16,10 +16,8 @@ from sceneprior.core.scene_json import check_openings
 from sceneprior.core.shell import Wall
 from sceneprior.lifted.requests.floors import Floor
 
-DOOR_M = (0.9, 0.0, 2.0)
-"""Default width, lower edge and upper edge of a door."""
-WINDOW_M = (1.2, 0.9, 2.1)
-"""Default width, lower edge and upper edge of a window."""
+USUAL_M = {"door": (0.9, 0.0, 2.0), "window": (1.2, 0.9, 2.1)}
+"""Default width, lower edge and upper edge of doors and windows."""
 MARGIN_M = 0.1
 """Distance of drawn doors and windows from the ends of their wall and from each other."""
 MOST_OPENINGS = 50
@@ -97,7 +95,7 @@ def _read_opening(entry: Any) -> Opening | WantedOpening:
                 f"An opening is {str(dict(entry))[:80]}; expected kind (door or window), start_m "
                 "and end_m as [x, z], and bottom_m and top_m where they differ from the usual."
             ) from None
-        _, bottom_m, top_m = DOOR_M if found.kind == "door" else WINDOW_M
+        _, bottom_m, top_m = USUAL_M[found.kind]
         bottom_m = bottom_m if found.bottom_m is None else found.bottom_m
         top_m = top_m if found.top_m is None else found.top_m
         return Opening(found.kind, found.start_m, found.end_m, bottom_m, top_m)
@@ -133,7 +131,7 @@ def place_openings(
 def _placed(
     wanted: WantedOpening, walls: list[Wall], there: list[Opening], draws: np.random.Generator
 ) -> Opening:
-    width_m, bottom_m, top_m = DOOR_M if wanted.kind == "door" else WINDOW_M
+    width_m, bottom_m, top_m = USUAL_M[wanted.kind]
     choice = walls_for(wanted, walls)
     room_m = np.array([max(wall.length_m - width_m - 2 * MARGIN_M, 0.0) for wall in choice])
     taken = shapely.MultiLineString([[each.start_m, each.end_m] for each in there])

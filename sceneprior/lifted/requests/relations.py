@@ -298,7 +298,7 @@ class RelationChecks:
                 and not any(square.intersects(place) for place in taken)
             ]
             most = max([most, *(free.count(end) for end in free)])
-        return most if wish.count <= 2 else len(furniture.back)
+        return most if wish.count <= 2 else wish.count
 
     def _number(self, wish: RelationWish, furniture: Furniture) -> int:
         """The number of objects of the subject's class for which the relation holds."""
@@ -318,7 +318,7 @@ class RelationChecks:
             return int(max(numbers, default=0))
         if wish.relation == "beside" and label in BEDS:
             beds = targets.pieces(self.classes)
-            found = np.array([beside_bed(subjects, bed)[:, 0] != 0 for bed in beds]).T
+            found = np.array([beside_bed(subjects, bed)[:, 0] != 0 for bed in beds], dtype=bool).T
             found = found.reshape(len(subjects.back), len(beds))
         else:
             found = related(wish.relation, subjects, targets, label)

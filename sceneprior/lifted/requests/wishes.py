@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import product
 from typing import Any
 
 from sceneprior.core.arrangements import BEDS, CHAIRS, NIGHTSTANDS, OPENED, TABLES
@@ -120,10 +119,12 @@ class Wishes:
             for label in OPENED
             if label in least and (label, "at a wall") not in said
         ]
-        for chair, table in product(CHAIRS, TABLES):
-            if chair in least and table in least and chair not in placed:
-                count = least[chair] if table == "table" else 1
-                found.append(RelationWish(chair, "at", table, count))
+        for chair in CHAIRS:
+            left = 0 if chair in placed else least.get(chair, 0)
+            for table in filter(least.__contains__, TABLES):  # `table` is the last, for the rest
+                count = left if table == "table" else min(left, 1)
+                found += [RelationWish(chair, "at", table, count)] * bool(count)
+                left -= count
         beds = [label for label in BEDS if label in least]
         for stand in NIGHTSTANDS:
             if len(beds) == least.get(beds[0] if beds else "") == 1 and least.get(stand) == 2:

@@ -43,9 +43,6 @@ class Contents(nn.Module):
         dropout: Dropout rate between them.
     """
 
-    known: Tensor
-    """True for the classes that may be sampled: those of the training rooms, and `END`."""
-
     most: Tensor
     """Largest number of each class in a training room."""
     excluded: Tensor

@@ -267,10 +267,16 @@ class RoomSampler(nn.Module):
         others = self.look_class[: self.looks] != label.unsqueeze(-1)
         return logits.masked_fill(others, -torch.inf)
 
+    def is_known(self, rooms: PosedRooms) -> Bool[Tensor, "rooms objects"]:
+        """True for objects with a look of their class; given ones of a class that no prototype
+        shows have none."""
+        assert rooms.looks is not None
+        return rooms.is_object & (self.look_class[rooms.looks] == rooms.object_class)
+
     def excluded_looks(self, before: PosedRooms) -> Bool[Tensor, "rooms looks"]:
         """Looks of prototypes that no room has together with one that is there."""
         assert before.looks is not None
-        barred = self.exclusive[before.looks // POSES] & before.is_object.unsqueeze(-1)
+        barred = self.exclusive[before.looks // POSES] & self.is_known(before).unsqueeze(-1)
         return barred.any(dim=1).repeat_interleave(POSES, dim=1)[:, : self.looks]
 
     def draw_size(
@@ -295,7 +301,7 @@ class RoomSampler(nn.Module):
         size_m[:, 1] += bottom_m * hidden
         size_m, bottom_m = _swapped(look, size_m), bottom_m * ~hidden
         assert before.looks is not None
-        twins = before.is_object & (before.looks // POSES == prototype.unsqueeze(1))
+        twins = self.is_known(before) & (before.looks // POSES == prototype.unsqueeze(1))
         for row in twins.any(dim=1).nonzero()[:, 0].tolist():
             twin = int(twins[row].int().argmax())
             centre_m, extents_m = before.boxes_m[row, twin].split(3)

@@ -256,7 +256,7 @@ class AxisScore(nn.Module):
         self,
         places: Places,
         anchors: Anchors,
-        relations: tuple[Float[Tensor, "rooms #anchors objects _"], ...],
+        relations: tuple[Float[Tensor, " rooms #anchors objects _"], ...],
         sides: Float[Tensor, "rooms anchors features"],
     ) -> LogisticMixture:
         """The mixture along the axis of the `anchors`, by the neighbours at each of them.

@@ -77,7 +77,7 @@ class SamplerRooms:
         kept = [torch.from_numpy(row[looks[row] >= 0]) for row in rows]
 
         def padded(values: np.ndarray) -> Tensor:
-            return pad_sequence([torch.from_numpy(values)[row] for row in kept], batch_first=True)
+            return _padded([torch.from_numpy(values)[row] for row in kept])
 
         self.prototypes = prototypes
         self.rooms = PosedRooms(
@@ -96,7 +96,7 @@ class SamplerRooms:
             torch.from_numpy(gaps_to_walls(boxes_m[row.numpy()], walls))
             for row, walls in zip(kept, lifted.walls, strict=True)
         ]
-        self.to_walls_m = pad_sequence(to_walls, batch_first=True)
+        self.to_walls_m = _padded(to_walls)
         self.backs, self.confidence, posed = orient(
             self.rooms, self.to_walls_m, padded(errors), prototypes,
             label_set(self.label_set), backs,
@@ -207,3 +207,9 @@ def large_first(
     places = label.gather(1, order).argsort(dim=1, stable=True)
     objects = by_size.gather(1, label.gather(1, by_size).argsort(dim=1, stable=True))
     return torch.empty_like(order).scatter(1, places, objects)
+
+
+def _padded(rows: list[Tensor]) -> Tensor:
+    """The rows as one tensor, with room for one object at least."""
+    padded = pad_sequence(rows, batch_first=True)
+    return padded if padded.shape[1] else padded.new_zeros(len(rows), 1, *padded.shape[2:])

@@ -115,9 +115,11 @@ class SamplerStage(lightning.LightningModule):
         rooms = self.val.to(self.device).rooms
         generator = torch.Generator().manual_seed(self.seed)
         plain = torch.zeros_like(rooms.object_class[:, 0])
-        found = [
-            negative_log_likelihood(self.learner, rooms, plain, generator) for _ in range(ORDERS)
-        ]
+        with full_precision(self.device):
+            found = [
+                negative_log_likelihood(self.learner, rooms, plain, generator)
+                for _ in range(ORDERS)
+            ]
         return (
             torch.stack([part.mean() for parts in found for part in parts.values()]).sum() / ORDERS
         )

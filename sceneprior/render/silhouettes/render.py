@@ -2,8 +2,7 @@
 
 import importlib
 import math
-from collections.abc import Callable
-from typing import NamedTuple, ParamSpec
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -174,15 +173,6 @@ def _check_values(
     )
 
 
-Arguments = ParamSpec("Arguments")
-
-
-def _masks_of(draw: Callable[Arguments, RenderedScene]) -> Callable[Arguments, Tensor]:
-    def render_silhouettes(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Tensor:
-        """The masks of `render_scene`, which documents the arguments and errors."""
-        return draw(*args, **kwargs).masks
-
-    return render_silhouettes
-
-
-render_silhouettes = _masks_of(render_scene)
+def render_silhouettes(*args: Any, **kwargs: Any) -> Tensor:
+    """The masks of `render_scene`, which documents the arguments and errors."""
+    return render_scene(*args, **kwargs).masks

@@ -223,6 +223,16 @@ def test_export_goes_both_ways(command, tmp_path):
     assert {path.stem for path in (tmp_path / "back").glob("*.json")} == {"first", "second"}
 
 
+def test_converted_box_lists_have_walls_if_asked_for(command, tmp_path):
+    bed = SceneObject("double_bed", (0.2, 0.3, -0.9), (1.7, 0.6, 2.1))
+    write_scenes([Scene("room", BEDROOM, (bed,))], tmp_path / "rooms")
+    assert command("export", "rooms", "--to", "atiss", "--out", "atiss")[0] == 0
+    back = ["export", "atiss", "--to", "scenes", "--out", "back", "--label-set", BEDROOM]
+    assert command(*back, "--shell", "walls")[0] == 0
+    nodes = trimesh.load_scene(tmp_path / "back" / "room.glb").graph.nodes_geometry
+    assert {"floor", "wall_0", "wall_3"} <= set(nodes)
+
+
 def test_a_strict_export_without_an_object_has_status_3(command, tmp_path):
     void = SceneObject("void", (0.2, 0.3, -0.9), (1.7, 0.6, 2.1))
     write_scenes([Scene("room", BEDROOM, (void,))], tmp_path / "rooms")

@@ -9,6 +9,7 @@ import pytest
 from sceneprior.apps.experiments import commands
 from sceneprior.apps.experiments.commands import demo_commands, finished_commands, run_demo
 from sceneprior.core.errors import InputError
+from sceneprior.core.settings import apply_override
 
 SETTINGS = ("demo.yaml", 20, 4)
 COMMANDS = ["make-homes", "prep-front", "fit", "synthesize", "eval-fid", "report"]
@@ -52,6 +53,14 @@ def test_finished_steps_are_not_repeated_and_their_costs_are_scores(ran, tmp_pat
     assert "fit: done before, 2 s\n" in capsys.readouterr().err
     told, seconds = finished_commands(tmp_path)
     assert [command.split()[1] for command in told] == COMMANDS and seconds == 12.0
+
+
+@pytest.mark.parametrize("name", ["my #1", "a: b"])
+def test_folders_of_any_name_are_read_as_they_are(name):
+    (fit,) = (step for step in demo_commands(Path(name), *SETTINGS) if step.name == "fit")
+    data = {}
+    apply_override(data, fit.arguments[fit.arguments.index("--set") + 1])
+    assert data == {"data": {"shards": f"{name}/shards"}}
 
 
 def test_what_follows_a_step_that_is_done_again_is_done_again(ran, tmp_path):

@@ -9,12 +9,15 @@ import numpy as np
 import pytest
 
 from sceneprior.apps.api import load
-from sceneprior.apps.experiments.evaluate import mask_scores
+from sceneprior.apps.experiments import evaluate
+from sceneprior.apps.experiments.evaluate import evaluate_run, mask_scores
 from sceneprior.apps.rooms import write_scenes
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.errors import InputError
 from sceneprior.core.shards import iterate_rooms
 from sceneprior.evaluation.metrics.contents import class_counts
+from sceneprior.evaluation.synthesis import EvalOptions
+from sceneprior.evaluation.use import UseOptions
 from sceneprior.paper.sampling import COPIES
 
 
@@ -99,6 +102,13 @@ def test_a_run_without_3d_truth_has_a_page_and_scores_from_views(
     again = json.loads((tmp_path / "made" / "scores.json").read_text())
     assert again["category_kl"] == pytest.approx(scores["category_kl"])
     assert again["intervals"]["generated"]["mean_objects"] is None
+
+
+def test_a_request_stands_in_the_protocol(toy_run, monkeypatch):
+    monkeypatch.setattr(evaluate, "scores_of", lambda *given: {"protocol": {}})
+    for asked in ({"floor": "4x3", "want": "a desk"}, None):
+        scores = evaluate_run(toy_run, 2, EvalOptions(), use=UseOptions(), asked=asked)
+        assert scores["protocol"].get("request") == asked
 
 
 def test_views_that_training_never_saw_are_held_out(toy_shards, toy_run):

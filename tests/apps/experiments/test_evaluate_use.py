@@ -1,6 +1,7 @@
 """`evaluate` from the command line: scenes without shards, a run with them."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -44,6 +45,21 @@ def test_a_run_stands_beside_real_and_random_rooms(command, toy_run, toy_shards,
     # Decoded rooms have no floor, so what needs one is left out of the real rooms' column, too.
     assert "physcene_reach_test" not in scores
     assert "physcene_reach" in scores["protocol"]["left_out"]
+
+
+def test_results_of_use_alone_name_their_rooms_and_are_tabulated(
+    command, scenes, toy_shards, tmp_path
+):
+    call = ["evaluate", "--scenes", scenes, "--shards", toy_shards, "--only-use"]
+    status, _, errors = command(*call, "--settle", "none", "--resamples", 0, "--out", "one.json")
+    assert status == 0, errors
+    protocol = json.loads((tmp_path / "one.json").read_text())["protocol"]
+    assert (protocol["shards"], protocol["split"]) == (toy_shards.name, "test")
+    shutil.copy(tmp_path / "one.json", tmp_path / "two.json")
+    status, _, errors = command("compare", "one.json", "two.json", "--out", "tables")
+    assert status == 0, errors
+    table = (tmp_path / "tables" / "table.md").read_text()
+    assert f"4 generated rooms per run against 4 test rooms of {toy_shards.name}" in table
 
 
 def test_a_run_has_all_scores_at_once_and_a_page_of_them(command, toy_run, tmp_path):

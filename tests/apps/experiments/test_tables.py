@@ -100,20 +100,29 @@ def test_best_is_what_no_interval_of_another_row_overlaps(key, intervals, marks)
     assert [line.cells[0].mark for line in table.lines] == [*marks, ""]
 
 
-def test_results_of_another_protocol_are_set_apart_and_undefined_values_are_dashes(tmp_path):
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("n_test", 7, "test rooms 7 in place of 3"),
+        ("request", {"floor": "4x3"}, "requested rooms {'floor': '4x3'} in place of None"),
+    ],
+)
+def test_results_of_another_protocol_are_set_apart_and_undefined_values_are_dashes(
+    tmp_path, key, value, said
+):
     written = {}
     for number, name in enumerate(("one", "two", "other")):
         path = tmp_path / name / "scores.json"
         write_new_rooms(path, number, "its own", remembers=False)
         written[name] = path
     odd = json.loads(written["other"].read_text())
-    odd["protocol"]["n_test"], odd["note"] = 7, "4 of 4 generated rooms are empty: train longer."
+    odd["protocol"][key], odd["note"] = value, "4 of 4 generated rooms are empty: train longer."
     write_json(written["other"], odd)
     paths = [str(path) for path in written.values()]
     assert compare_sources(paths, None, tmp_path, None, EvalOptions()) == 2
     near, far = (tmp_path / "table.md").read_text().split("### ")[1:]
     assert "| one |" in near and "| two |" in near and "| other |" not in near
-    assert "test rooms 7 in place of 3.\n" in far
+    assert f"{said}.\n" in far
     cells = next(line for line in far.splitlines() if line.startswith("| other |")).split(" | ")
     assert sorted({cell.strip("| ") for cell in cells[2:]}) == ["22.49 [20.24, 24.74]", "–"]
 

@@ -19,6 +19,7 @@ from sceneprior.apps.reconstruction.own_image import (
 from sceneprior.core.cameras import camera_at
 from sceneprior.core.classes import label_set
 from sceneprior.core.id_tables import tidy
+from sceneprior.core.observations import thinned_intrinsics
 from sceneprior.core.views import images_of_split
 
 LABELS = "front3d_bedroom"
@@ -133,7 +134,8 @@ def test_large_pictures_are_thinned(own, tmp_path):
     (image,), _ = read(tmp_path / "large.png", classes, pose, "480,480,480,360")
     (small,), _ = read(mask, classes, pose)
     assert image.instance_ids.shape == (360, 480)
-    np.testing.assert_allclose(image.intrinsics, np.diag([5, 5, 1]) @ small.intrinsics)
+    lens = np.diag([10, 10, 1]) @ small.intrinsics
+    np.testing.assert_allclose(image.intrinsics, thinned_intrinsics(lens, 2))
     np.testing.assert_array_equal(image.instance_ids[2::5, 2::5], small.instance_ids)
 
 

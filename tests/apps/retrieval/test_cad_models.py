@@ -108,6 +108,17 @@ def test_points_are_sampled_once_and_again_where_a_file_changed(folder, read):
     np.testing.assert_array_equal(beds, opened(folder).of_class("double_bed").points)
 
 
+def test_points_for_one_label_set_stay_when_another_is_opened(folder, read):
+    opened(folder, "void,double_bed")
+    opened(folder, "void,table")
+    assert sorted(read) == ["bed", "flat", "huge"]
+    write_model(folder, "huge", corner_sofa())
+    read.clear()
+    opened(folder, "void,table")
+    opened(folder, "void,double_bed")
+    assert read == ["huge"]
+
+
 def test_points_sampled_before_an_interrupt_are_kept(folder, read, monkeypatch):
     def stop_after_two(ids, *_, **__):
         yield from ids[:2]

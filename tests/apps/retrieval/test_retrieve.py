@@ -203,6 +203,25 @@ def test_a_mesh_without_a_model_stays_in_step_with_its_box(models):
     np.testing.assert_allclose(item.mesh.vertices_m, grown, atol=1e-12)
 
 
+@pytest.mark.parametrize("center_y", [0.4, 0.6, 1.5])
+def test_objects_without_a_model_keep_their_yaw(models, center_y):
+    """A plant that stands, one that grows down to the floor, and one that hangs."""
+    turned = quarter_turned((0.6, 0.8, 0.4), 1)
+    plant = SceneObject("plant", (1.0, center_y, 0.0), (0.6, 0.8, 0.4), turned=turned)
+    (item,) = retrieve(room(plant), models).objects
+    width, _, depth = turned.size_m
+    assert item.turned == turned._replace(size_m=(width, item.size_m[1], depth))
+
+
+def test_objects_that_are_kept_keep_their_entry(models):
+    sofas = [SceneObject("sofa", (3.0 * k, 0.4, 0.0), (2.0, 0.8, 1.2)) for k in range(2)]
+    before = {"model_id": "of before", "turn_deg": 90, "distance_m": 0.5}
+    given = replace(room(*sofas), extra={"retrieval": [before]})
+    first, second = retrieve(given, models, keep=[0]).extra["retrieval"]
+    assert first == before and second["model_id"] == "plain"
+    assert retrieve(given, models, keep=[1]).extra["retrieval"][1] is None  # it had no entry
+
+
 def test_rooms_without_objects_and_objects_without_volume_have_defined_answers(models):
     assert retrieve(room(), models).extra["retrieval"] == []
     flat = SceneObject("sofa", (0.0, 0.0, 0.0), (1.0, 0.0, 1.0))

@@ -1,5 +1,7 @@
 """Houses to shards: right boxes, the same bytes whatever the workers, failures for themselves."""
 
+import json
+
 import numpy as np
 import pytest
 from front_files import bedroom, room
@@ -121,6 +123,35 @@ def test_each_room_fails_for_itself_and_is_tried_again_when_asked(tmp_path):
     again = build_shards(Job(ToySource(), out, retry_failed=True))
     assert (again.shards_made, again.shards_kept) == (1, 1)
     assert again.statuses == {"prepared": 10, "filtered": 1}
+
+
+@pytest.mark.parametrize("name", ["intrinsics", "centers_m"])
+def test_a_room_with_numbers_that_are_not_finite_fails(tmp_path, name):
+    out = tmp_path / "shards"
+    summary = build_shards(Job(ToySource(5, trouble={1: name}), out))
+    (reason,) = (line.reason for line in summary.lines if line.status == "failed")
+    assert reason == f"box, room box_1: {name} holds numbers that are not finite."
+    assert sorted(rooms_of(out)) == ["box_0", "box_2", "box_3", "box_4"]
+
+
+@pytest.mark.parametrize("rooms", [21, 25], ids=["in a new shard", "in a shard with others"])
+def test_rooms_that_failed_in_the_survey_are_tried_again_when_asked(tmp_path, rooms):
+    """The train shards hold 8, 8 and, of 25 rooms, 3 rooms."""
+    out = tmp_path / "shards"
+    first = build_shards(Job(ToySource(rooms, trouble={2: "survey"}), out))
+    assert first.statuses == {"prepared": rooms - 1, "filtered": 1, "failed": 1}
+    before, planned = digests(out), ids_of_plan(out)
+    assert build_shards(Job(ToySource(rooms), out)).shards_made == 0
+    assert digests(out) == before
+    again = build_shards(Job(ToySource(rooms), out, retry_failed=True))
+    assert again.statuses == {"prepared": rooms, "filtered": 1}
+    assert (again.shards_made, again.shards_kept) == (1, 3)
+    assert ids_of_plan(out) == [*planned, "box_2"] and "box_2" in rooms_of(out)
+    assert build_shards(Job(ToySource(rooms), out, retry_failed=True)).shards_made == 0
+
+
+def ids_of_plan(out):
+    return [room["room_id"] for room in json.loads((out / "plan.json").read_text())["rooms"]]
 
 
 def test_a_damaged_report_is_work_to_do(tmp_path):

@@ -80,5 +80,5 @@ def test_what_a_worker_left_that_died_on_the_way_is_cleared_away_at_the_end(tmp_
     with claimed(out):
         (out / "whole").touch()
         (out / "train").mkdir()
-        (out / "train" / "toys_0001.report.json.21dc.part").write_bytes(b"half")
+        (out / "train" / "toys_0001.report.json.21dc0a4f.part").write_bytes(b"half")
     assert [path.name for path in out.rglob("*") if path.is_file()] == ["whole"]

@@ -16,6 +16,7 @@ from golden_values import hold
 from PIL import Image
 
 from data_prep.engine.build import Job, build_shards
+from data_prep.inspection.causes import C2W, OPENGL, Cause, Convention, sentence_of
 from data_prep.inspection.diagnosis import find_mistake
 from data_prep.inspection.tables import summary, verdict
 from data_prep.inspection.verify import evidence_of, read_conventions, verify
@@ -228,6 +229,33 @@ def test_the_first_cause_named_is_the_mistake(captures, name, tmp_path):
     wrong = changed(captures, tmp_path / "wrong", MISTAKES[name])
     said = first_said(wrong, tmp_path / "shards")
     hold("mistakes", {name: said}, slack=0.02, tmp=tmp_path)
+
+
+ROS = ((0, 0, 1), (-1, 0, 0), (0, -1, 0))
+UNREAL = ((0, 0, 1), (1, 0, 0), (0, -1, 0))
+
+
+@pytest.mark.parametrize("axes", [ROS, UNREAL])
+def test_columns_in_another_order_are_told_with_their_signs(axes):
+    """The columns, put as the sentence says, are those of OpenGL's axes."""
+    said = sentence_of(Cause("poses", (C2W, axes)), Convention.stated("posed"))
+    columns = dict(zip(("first", "second", "third"), np.linalg.inv(axes).T, strict=True))
+    columns |= {f"minus the {name}": -column for name, column in columns.items()}
+    told = said.partition("let the first three columns of each matrix be ")[2].split(", ")
+    found = [columns[words.removeprefix("the ")] for words in told]
+    np.testing.assert_array_equal(np.stack(found, axis=1), np.linalg.inv(OPENGL))
+
+
+def test_a_damaged_shard_hides_no_mistake_of_another_room(captures, tmp_path):
+    two = tmp_path / "two"
+    for room in sorted(captures.iterdir())[:2]:
+        shutil.copytree(room, two / room.name)
+    shards = shards_of(changed(two, tmp_path / "wrong", of_poses(_shuffled)), tmp_path / "shards")
+    (path,) = (shards / "test").glob("*.h5")
+    path.write_bytes(path.read_bytes()[:3000])
+    damage, mistake = verify(shards).problems
+    assert damage.startswith(f"{path} cannot be read")
+    hold("mistakes", {"shuffled, beside a damaged shard": mistake}, slack=0.02, tmp=tmp_path)
 
 
 @pytest.mark.parametrize(("rooms", "seed", "views_per_m2"), [(2, 120, 0.5), (3, 196, 0.8)])

@@ -92,6 +92,25 @@ def test_the_commands_of_public_data_md_write_shards_that_verify(room, tmp_path,
             assert [item.label for item in scene.objects] == ["bed", "chair"]
 
 
+def test_a_scene_that_could_not_be_listed_is_prepared_when_it_is_mended(room, tmp_path, cli):
+    folder = tmp_path / "renders"
+    for k in range(3):
+        write_blenderproc(folder, f"house_{k}", room)
+    whole = {path: path.read_bytes() for path in (folder / "house_1").iterdir()}
+    for path, content in whole.items():
+        path.write_bytes(content[:900])
+    words = ("prep-dataset", "blenderproc", folder, "--out", tmp_path / "a", "--workers", 1)
+    for more in ((), ("--retry-failed",)):
+        assert cli(*words, *more).exit_code == 3
+    for path, content in whole.items():
+        path.write_bytes(content)
+    assert "0 shards made" in " ".join(cli(*words).stdout.split())
+    done = cli(*words, "--retry-failed")
+    assert done.exit_code == 0, done.output
+    index = json.loads((tmp_path / "a" / "index.json").read_text())
+    assert sum(count["rooms"] for count in index["counts"].values()) == 3
+
+
 # -- What single data sets have --------------------------------------------------------------------
 
 

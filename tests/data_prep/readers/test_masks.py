@@ -12,6 +12,7 @@ from PIL import Image
 from posed_files import SET, PosedRoom, furniture, prepared
 from refusals import refused
 
+from data_prep.readers.posed.coco import PanopticPngs
 from data_prep.readers.posed.formats import MASKS, read_class_map, read_formats, read_label_set
 from data_prep.readers.posed.masks import find_table
 from data_prep.readers.posed.reader import Posed
@@ -160,6 +161,52 @@ def test_names_are_mapped_to_classes(room, tmp_path):
         table.write_text(row)
         with pytest.raises(InputError, match=r"map.csv, row 1 .*expected a name of the masks"):
             read_class_map(table, SET)
+
+
+def bed_as_stuff(room):
+    def change(data):
+        data["categories"][0] |= {"name": "cabinet-merged", "isthing": 0}
+
+    tools.write_panoptic(room, change)
+
+
+def bed_of_two_names(room):
+    def change(data):
+        data["categories"].append({"id": 190, "name": "couch", "isthing": 1})
+        for segment in data["annotations"][1]["segments_info"]:
+            segment["category_id"] = {65: 190}.get(segment["category_id"], segment["category_id"])
+
+    tools.write_panoptic(room, change)
+
+
+def bed_of_three_names(room):
+    tools.write_grounded_sam2(room)
+    names = ("couch", "settee", "chair", "couch", "chair")
+    for k, path in enumerate(sorted(room.folder.glob("json_data/*.json"))):
+        path.write_text(path.read_text().replace('"bed"', f'"{names[k % 5]}"'))
+
+
+@pytest.mark.parametrize("write", [bed_as_stuff, bed_of_two_names, bed_of_three_names])
+def test_names_are_mapped_before_they_are_compared(room, plain, write):
+    """With what is stuff, with the names in other frames, and by votes: couch 4, settee 2 of 10."""
+    write(room)
+    pairs = tuple((name, "bed") for name in ("cabinet merged", "couch", "settee"))
+    same_masks(prepared(room, class_map=pairs).views, plain.views)
+
+
+def test_panoptic_frames_of_one_name_in_two_folders_have_their_own_classes(tmp_path):
+    frames = [
+        {"file_name": f"{folder}/0000.png", "segments_info": [{"id": 5, "category_id": k}]}
+        for k, folder in enumerate(("left", "right"))
+    ]
+    categories = [{"id": 0, "name": "bed"}, {"id": 1, "name": "chair"}]
+    table = {"annotations": frames, "categories": categories}
+    (tmp_path / "panoptic.json").write_text(json.dumps(table))
+    masks = PanopticPngs(tmp_path, SET)
+    pngs = [tmp_path / "instances" / frame["file_name"] for frame in frames]
+    assert [masks.of_png(path).classes() for path in pngs] == [{1: "bed"}, {1: "chair"}]
+    with refused("readers/panoptic classes that differ between folders", tmp=tmp_path):
+        masks.classes()
 
 
 def test_crowds_and_ids_without_a_segment_are_void(room):
@@ -328,6 +375,17 @@ def test_what_was_found_is_said(room, cli, tmp_path):
     assert "leave out --from sam2 to guess." in (tmp_path / "b" / "report.csv").read_text()
 
 
+@pytest.mark.parametrize("tool", WRITERS)
+def test_a_room_with_masks_and_no_poses_is_in_the_report(room, tool):
+    PosedRoom(room.folder.parent / "cellar", furniture(0.1)).write(floor_m=0.0)
+    WRITERS[tool](room)
+    (room.folder / "transforms.json").unlink()
+    survey = Posed(room.folder.parent, classes=SET).survey()
+    assert [task.room_id for task in survey.rooms] == ["cellar"]
+    (line,) = survey.left_out
+    assert (line.room_id, line.status) == ("attic", "failed") and "transforms.json" in line.reason
+
+
 def test_names_of_tools():
     assert read_formats([]) == {}
     for name in (*POSES, *MASKS):
@@ -352,3 +410,8 @@ def test_tables_and_label_sets(tmp_path, name, text):
     assert read_label_set(str(path)) == "void,bed,night stand"
     (tmp_path / "set.json").write_text('["bed", "chair"]')
     assert read_label_set(str(tmp_path / "set.json")) == SET
+
+
+def test_a_list_of_classes_may_be_longer_than_the_name_of_a_file():
+    classes = ",".join(["void", *(f"class number {k}" for k in range(50))])
+    assert len(classes) > 255 and read_label_set(classes) == classes

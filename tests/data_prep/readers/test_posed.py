@@ -1,13 +1,16 @@
 """Posed rooms to views: every box where the picture says, whatever the axes, units and lenses."""
 
 import json
+import os
 
 import numpy as np
 import pytest
 from colmap_files import write_colmap
 from PIL import Image
 from posed_files import SET, PosedRoom, furniture, prepared
+from refusals import refused
 
+from data_prep.engine.build import Job, build_shards
 from data_prep.engine.source import RoomTask
 from data_prep.inspection.verify import array_problems, mask_problems
 from data_prep.readers.posed.reader import Posed
@@ -188,6 +191,32 @@ def test_settings_follow_the_files(source, rooms):
         now = source.settings(None)
         path.write_bytes(path.read_bytes() + b" ")
         assert source.settings(None)["rooms"] != now["rooms"]
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        ("classes.json", b"Chair", b"table"),
+        ("transforms.json", b"80.0", b"90.0"),
+        ("instances/frame_00002.png", b"IEND", b"iEND"),
+    ],
+)
+def test_shards_of_a_file_that_changed_at_the_same_size_are_not_reused(
+    source, rooms, tmp_path, name, old, new
+):
+    job = Job(source, tmp_path / "shards")
+    build_shards(job)
+    assert build_shards(job).shards_made == 0
+    path = rooms[0].folder / name
+    path.write_bytes(path.read_bytes().replace(old, new))
+    with refused("readers/shards of older files", tmp=tmp_path):
+        build_shards(job)
+
+
+def test_a_room_whose_name_is_not_utf_8_is_to_be_renamed(source, rooms, tmp_path):
+    rooms[1].folder.rename(source.folder / os.fsdecode(b"K\xfcche"))
+    with refused("readers/name that is not UTF-8", tmp=tmp_path):
+        build_shards(Job(source, tmp_path / "shards"))
 
 
 def test_assumptions_are_said_before_the_work(source, rooms):

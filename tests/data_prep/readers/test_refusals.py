@@ -111,6 +111,9 @@ POSED: dict[str, Damage] = {
     "unknown camera model": keys(POSES, camera_model="FULL_OPENCV"),
     "fisheye with p2": keys(POSES, is_fisheye=True, p2=0.1),
     "lens that folds": keys(POSES, k1=-0.9),
+    "fisheye of larger pictures": keys(
+        POSES, camera_model="OPENCV_FISHEYE", k1=0.05, cx=640.0, cy=480.0, w=None, h=None
+    ),
     "no scale": keys(POSES, metres_per_unit=0),
     "wrong scale": keys(POSES, metres_per_unit=100),
     "half a centre": keys(POSES, floor_center_m=[1]),
@@ -240,6 +243,12 @@ OTHERS: dict[str, dict[str, Damage]] = {
         "image of another size": edit(COCO, lambda data: data["images"][0].update(height=97)),
         "no images": keys(COCO, images=None),
         "results": text(COCO, "[]"),
+        "image id twice": edit(
+            COCO, lambda data: data["images"].append(data["images"][0] | {"file_name": "b.jpg"})
+        ),
+        "category id twice": edit(
+            COCO, lambda data: data["categories"].append(data["categories"][0] | {"name": "chair"})
+        ),
         "two files": lambda folder: shutil.copy(folder / COCO, folder / VIDEO),
     },
     "coco, video": {

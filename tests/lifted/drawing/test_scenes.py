@@ -13,7 +13,7 @@ from sceneprior.apps.priors.packed import shipped_priors
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.classes import label_set
 from sceneprior.core.colliders import HUNG
-from sceneprior.core.errors import InputWarning
+from sceneprior.core.errors import InputError, InputWarning
 from sceneprior.core.scene import Scene, SceneObject
 from sceneprior.lifted.drawing.draw import draw_rooms
 from sceneprior.lifted.drawing.plans import BEYOND_M
@@ -147,3 +147,42 @@ def test_furniture_stands_on_the_floor_and_what_hangs_stays_there(prior):
                 assert item.center_m[1] == pytest.approx(box_m[1])
                 assert lowest >= bottom - 0.001
     assert len(reaching) > 60 and np.mean(reaching) > 0.9
+
+
+def test_one_room_without_place_for_its_windows_does_not_stop_the_others(prior):
+    asked = {"floor": "2.72x3", "openings": "window@north,window@north"}
+    rooms = prior.sample(2, **asked)
+    assert ["lacks" in room.extra for room in rooms] == [False, True]
+    (alone,) = prior.sample(1, **asked)
+    assert np.array_equal(alone.centers_m, rooms[0].centers_m)
+    with pytest.raises(InputError, match="finds no free wall"):
+        prior.sample(1, floor="2x3", openings="window@north,window@north")
+
+
+def test_what_the_prior_does_not_draw_is_nothing_elses_twin(prior):
+    """A class without prototypes has the number of the first one, which armchairs have."""
+    first = label_set(prior.label_set)[int(prior.trained.sampler.look_class[0])]
+    given = SceneObject("wardrobe", (0.0, 1.1, 0.0), (0.5, 2.2, 0.4))
+    assert "wardrobe" not in prior.classes or first != "wardrobe"
+    rooms = prior.complete(Scene("mine", prior.label_set, (given,)), 12, 0, classes=[first])
+    assert {labels(room)[1] for room in rooms} == {first}
+    assert all(room.objects[1].size_m[1] < 2.0 for room in rooms)
+
+
+@pytest.mark.filterwarnings("ignore::sceneprior.core.errors.InputWarning")
+def test_three_things_can_stand_beside_a_bed(prior):
+    beside = {"subject": "stool", "relation": "beside", "target": "double_bed", "count": 3}
+    want = {"double_bed": 1, "stool": 3, "relations": [beside]}
+    assert len(prior.sample(2, want=want, floor="6x6")) == 2
+
+
+def test_what_is_given_above_the_floor_stays_there(prior):
+    shelf = SceneObject("cabinet", (0.0, 0.5, 0.0), (0.8, 0.5, 0.4))
+    (room,) = prior.complete(Scene("mine", prior.label_set, (shelf,)), 1)
+    low = room.objects[0].mesh.vertices_m[:, 1].min()
+    assert room.objects[0].center_m == shelf.center_m and low == pytest.approx(0.25, abs=0.01)
+
+
+def test_too_many_objects_are_one_sentence(prior):
+    with pytest.raises(InputError, match="at most"):
+        prior.complete(Scene("mine", prior.label_set, (BED,)), 1, classes=["desk"] * 1001)

@@ -3,6 +3,7 @@
 import pytest
 import shapely
 
+from sceneprior.core.errors import InputError
 from sceneprior.lifted.requests.floors import Floor, read_floor
 
 L_SHAPE = [[0, 0], [5, 0], [5, 3], [2, 3], [2, 6], [0, 6]]
@@ -32,3 +33,10 @@ def test_rectangles_lie_in_the_floor_and_cover_most_of_it(floor):
     boxes = shapely.box(x - width / 2, z - depth / 2, x + width / 2, z + depth / 2)
     assert shape.polygon.buffer(0.005).covers(shapely.union_all(boxes))
     assert shapely.union_all(boxes).area > 0.85 * shape.polygon.area
+
+
+def test_a_corner_that_is_listed_twice_is_one_corner():
+    twice = [corner for corner in L_SHAPE for _ in range(2)]
+    assert read_floor(twice).tolist() == L_SHAPE
+    with pytest.raises(InputError):
+        read_floor([[0, 0], [0, 0], [4, 0], [4, 0]])

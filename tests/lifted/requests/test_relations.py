@@ -186,3 +186,9 @@ def test_opposite_and_at_the_foot():
     assert held("at the foot of", "sofa", "bed", bed, ("sofa", 0, sofa))
     assert not held("at the foot of", "sofa", "bed", bed, ("sofa", 0, [1.8, *sofa[1:]]))
     assert not held("at the foot of", "sofa", "bed", bed, ("sofa", 0, [0.0, 0.4, -1.0, *sofa[3:]]))
+
+
+def test_no_bed_is_beside_another_where_there_is_none():
+    wish = RelationWish("bed", "beside", "bed", 1)
+    checks = RelationChecks([wish], RoomShape(Floor(read_floor(FLOOR))), CLASSES)
+    assert checks.held(furniture(np.zeros((0, 6)), np.zeros(0, dtype=np.int64))) == [False]

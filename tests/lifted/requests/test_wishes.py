@@ -2,9 +2,11 @@
 
 import math
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sceneprior.core.errors import InputError
 from sceneprior.core.scene import Opening, SceneObject
 from sceneprior.lifted.requests.openings import WantedOpening
 from sceneprior.lifted.requests.request import RoomRequest
@@ -61,3 +63,20 @@ def test_the_parts_of_a_request_make_the_same_request(want, openings, ceiling_m)
     request = RoomRequest.of(want=want, openings=openings, ceiling_m=ceiling_m, floor="4x3")
     again = RoomRequest.of(**request.parts())
     assert again.parts() == request.parts() and again.wishes == request.wishes
+
+
+def test_chairs_are_dealt_out_to_tables_and_no_chair_is_wished_at_two():
+    found = read_wishes({"chair": 4, "table": 1, "desk": 1}).implied
+    assert {(str(wish.target), wish.count) for wish in found if wish.relation == "at"} == {
+        ("desk", 1), ("table", 3),
+    }  # fmt: skip
+    found = read_wishes({"chair": 1, "table": 1, "desk": 1}).implied
+    assert [wish.target for wish in found if wish.relation == "at"] == ["desk"]
+
+
+@pytest.mark.parametrize(("kind", "high"), [("door", 2.0), ("window", 2.1)])
+def test_drawn_doors_and_windows_are_below_the_ceiling(kind, high):
+    asked = RoomRequest(floor="4x3", openings=kind, ceiling_m=high - 0.2)
+    with pytest.raises(InputError, match=f"a {kind}, which is {high:g} m high"):
+        asked.conditions(KNOWN, LABELS, 9)
+    RoomRequest(floor="4x3", openings=kind, ceiling_m=high + 0.2).conditions(KNOWN, LABELS, 9)

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 from lightning.pytorch import Trainer
-from rooms_of_boxes import TINY, sampler_rooms, small_sampler
+from rooms_of_boxes import TINY, lifted_rooms, sampler_rooms, small_sampler
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tiny_runs import tiny_lifted, tiny_sampler_config
 from torch import nn
@@ -69,6 +69,23 @@ def test_with_val_rooms_the_likeliest_is_kept(monkeypatch):
     assert not all(torch.equal(v, states[2][k]) for k, v in states[1].items())
 
 
+def test_val_rooms_are_scored_in_full_precision():
+    rooms = sampler_rooms()
+    stage = stage_of(rooms, sampler_rooms(4, seed=1), epochs=1)
+    plain = stage.val_loss()
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(stage.val_loss(), plain)
+
+
+def test_val_rooms_without_an_object_that_is_known_have_a_likelihood():
+    """The prototypes are those of one room, which has no pole."""
+    lifted = lifted_rooms(4, seed=1)
+    lifted.object_classes[:] = 3
+    val = SamplerRooms(lifted).assign_prototypes(lifted_rooms(1).find_prototypes(99))
+    assert not val.rooms.is_object.any()
+    assert stage_of(sampler_rooms(), val, epochs=1).val_loss().isfinite()
+
+
 def test_a_run_ends_with_a_sampler(sampler_run):
     trained = load_any_run(sampler_run)
     assert trained.stage == "sampler"
@@ -121,3 +138,14 @@ def test_turned_copies_keep_their_latents(toy_shards, tmp_path):
 def test_what_does_not_fit_is_refused(toy_shards, changes, says):
     with pytest.raises(ConfigError, match=says):
         tiny_lifted(toy_shards, **changes)
+
+
+def test_there_are_as_many_prototypes_as_classes_at_least(toy_shards, tmp_path):
+    with pytest.raises(
+        ConfigError, match=r"prototypes is 2, but the rooms have objects of \d class"
+    ):
+        fit(
+            tiny_lifted(toy_shards, model__shape__prototypes=2),
+            tmp_path / "run",
+            trainer_options=CPU,
+        )

@@ -6,8 +6,11 @@ import pytest
 import torch
 from references import losses as by_hand
 
-from sceneprior.paper.losses import mask_loss
+from sceneprior.core.observations import thinned
+from sceneprior.core.proxies import icosphere
+from sceneprior.paper.losses import mask_loss, seen_masks
 from sceneprior.paper.matching import match_objects
+from sceneprior.paper.settings import ShapeConfig
 
 
 def masks(batch, seed=0, sharp=1.0):
@@ -93,3 +96,17 @@ def test_certain_masks_pull_no_harder_than_doubtful_ones(batch):
         assert not leaf.grad[..., :1, :1].any()
         # Other pixels: rendered between 0 and 0.95 of a number from torch.rand.
         assert 0 < leaf.grad.abs().max() < 10
+
+
+@pytest.mark.parametrize("step", [1, 2, 3, 4, 6])
+def test_sharp_masks_are_the_thinned_pixels_of_whole_ones(batch, step):
+    unit, faces = icosphere(1)
+    vertices_m = batch.scenes.centers_m[:, :, None] + 0.6 * unit
+    settings, every = ShapeConfig(epochs=1, sigma_px2=1e-9), (..., *thinned(step))
+    found = []
+    whole = torch.zeros(3, 6, *batch.views.image_size, dtype=torch.int64)
+    for ids in (whole, whole[every]):
+        views = replace(batch.views, instance_ids=ids)
+        found.append(seen_masks(vertices_m, faces, views, settings) > 0.5)
+    assert 0.005 < found[1].double().mean() < 0.5
+    assert torch.equal(found[1], found[0][every])
