@@ -40,8 +40,8 @@ MAY_TOO = {
 }
 
 BUDGET = {
-    "data_prep": (12783, 60),
-    "sceneprior/core": (6701, 30),
+    "data_prep": (12789, 60),
+    "sceneprior/core": (6714, 30),
     "sceneprior/furniture": (591, 4),
     "sceneprior/render": (4618, 23),
     "sceneprior/training": (1565, 9),
@@ -50,7 +50,7 @@ BUDGET = {
     "sceneprior/baselines": (2933, 14),
     "sceneprior/evaluation": (4478, 21),
     "sceneprior/interchange": (928, 5),
-    "sceneprior/apps": (7403, 42),
+    "sceneprior/apps": (7407, 42),
 }
 """Most lines and modules of a folder. They go down freely, and up only in a commit that says what
 it bought and what went for it."""

@@ -15,7 +15,14 @@ import numpy as np
 import shapely
 from jaxtyping import Bool, Float
 
-from sceneprior.core.colliders import colliders, is_fixed, mesh_of, points_of, volume_and_centroid
+from sceneprior.core.colliders import (
+    LEAST_M3,
+    colliders,
+    is_fixed,
+    mesh_of,
+    points_of,
+    volume_and_centroid,
+)
 from sceneprior.core.scene import Mesh, Scene, SceneObject, Solid, Textured, join_meshes
 from sceneprior.core.shell import floor_polygon
 
@@ -307,7 +314,9 @@ def is_stable(item: SceneObject) -> bool:
         shapely.convex_hull(shapely.MultiPoint(each)) for each in (low, points[:, ::2])
     )
     volumes, centers = zip(*(volume_and_centroid(body) for body in bodies), strict=True)
-    middle = shapely.Point(np.average(np.array(centers), axis=0, weights=np.array(volumes))[::2])
+    middle = shapely.Point(
+        np.average(np.array(centers), axis=0, weights=np.maximum(volumes, LEAST_M3))[::2]
+    )
     if not support.area or not support.contains(middle):  # without area: an edge or a tip
         return False
     return bool(middle.distance(support.exterior) >= MARGIN * middle.distance(plan.exterior))

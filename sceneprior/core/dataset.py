@@ -270,6 +270,7 @@ class ViewDataset(RoomDataset):
             sides_clear=flat.sides_clear[at_sighting],
             image_size=self._image_sizes[rooms[0]],
             instance_ids=ids,
+            mask_step=1 if self.masks is None else self.masks.step,
             room_ids=tuple(self.plain_ids[room] for room in rooms),
         )
 

@@ -69,6 +69,8 @@ class SceneViews(Batch):
     instance_ids: Integer[Tensor, "rooms views height width"] | None = None
     """Downsampled images of ids: 0 for background, k + 1 for object k, n + 1 for void in a room of
     n objects. None except in the shape stage."""
+    mask_step: int = 1
+    """Step of `thinned` by which `instance_ids` are downsampled."""
     room_ids: tuple[str, ...] = ()
 
     @cached_property
@@ -147,7 +149,7 @@ class SceneViews(Batch):
     def mask_intrinsics(self, pooling: int = 1) -> Float[Tensor, "rooms views 3 3"]:
         """Intrinsics in pixels of the instance-id images (as `thinned_intrinsics`), or of images
         in which squares of `pooling` of these pixels are one."""
-        step = round(max(self.image_size) / max(self.observed_ids.shape[-2:]))
+        step = self.mask_step
         shift = step / 2 - step // 2 - 0.5
         shifted = self.intrinsics + F.pad(
             constants(self.intrinsics, shift, shift, 0)[:, None], (2, 0)
@@ -365,6 +367,7 @@ def as_views(images: Sequence[ObservedImage], mask_step: int) -> SceneViews:
         sides_clear=padded([image.sides_clear for image in images])[:, None],
         image_size=sizes[0],
         instance_ids=stacked([image.sampled_ids(mask_step) for image in images], np.int32),
+        mask_step=mask_step,
         room_ids=tuple(image.name for image in images),
     )
 

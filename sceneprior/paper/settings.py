@@ -96,7 +96,7 @@ class StageConfig(LatentStageConfig):
         if self.latent_epochs > self.epochs:
             raise ValueError(
                 f"latent_epochs is {self.latent_epochs}, but they are part of the stage's "
-                f"{self.epochs} epochs; raise epochs"
+                f"{self.epochs} epochs; raise epochs, or lower latent_epochs"
             )
         return self
 

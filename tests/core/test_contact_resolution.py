@@ -181,3 +181,9 @@ def test_closed_components_are_bodies_of_their_own(monkeypatch):
 
 def at(x: float, y: float, z: float) -> np.ndarray:
     return trimesh.transformations.translation_matrix([x, y, z])
+
+
+@pytest.mark.parametrize("size_m", [(1.0, 0.0, 1.0), (1.0, 1.0, 0.0)])
+def test_flat_boxes_are_settled_like_others(size_m):
+    flat = SceneObject("desk", (0.0, 0.5, 0.0), size_m)
+    assert len(make_stable(Scene("flat", "front3d_bedroom", (flat,))).scene.objects) == 1

@@ -266,7 +266,12 @@ class PanopticPngs(FramePngs):
             if f"/{whole}".endswith(f"/{name}") or f"/{name}".endswith(f"/{whole}")
         ]
         stems = [name for name in named if Path(name).name == path.stem]
-        return max(fits, key=len) if fits else stems[0] if len(stems) == 1 else ""
+        if len(fits or stems) > 1:
+            raise InputError(
+                f"{path} may be {' or '.join(map(shown, sorted(fits or stems)))} of {PANOPTIC}; "
+                f"name its frames there by their paths below {INSTANCES}/."
+            )
+        return (fits or stems or [""])[0]
 
     @cached_property
     def _segments(self) -> tuple[np.ndarray, dict[str, dict[int, str]], set[str]]:

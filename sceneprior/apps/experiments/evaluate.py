@@ -1,5 +1,6 @@
 """Evaluate a run, or a folder of the user's scenes, by shards with or without 3D ground truth."""
 
+import json
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -91,7 +92,8 @@ def evaluate_run(
         latents = marked(distribution or trained.distribution)
     scores["protocol"] |= {"run": Path(run).name, "stage": trained.stage, "latents": latents}
     if asked:
-        scores["protocol"]["request"] = asked
+        # Given objects are told by their values.
+        scores["protocol"]["request"] = json.loads(json.dumps(asked, default=repr))
     return scores
 
 

@@ -72,7 +72,9 @@ def retrieve(
     """
     objects: list[SceneObject] = []
     found: list[dict[str, Any] | None] = []
-    before = scene.extra.get("retrieval", [])
+    before = scene.extra.get("retrieval")
+    if not isinstance(before, list) or len(before) != len(scene.objects):
+        before = [None] * len(scene.objects)
     for row, item in enumerate(scene.objects):
         box, told = item if row in keep else extruded(item), None
         if row not in keep and (of_class := models.of_class(item.label)):
@@ -91,7 +93,7 @@ def retrieve(
             if box is not item:
                 item = replace(item.in_box(box.center_m, box.size_m), turned=box.turned)
             objects.append(item)
-            told = before[row] if row in keep and row < len(before) else None
+            told = before[row] if row in keep else None
         found.append(told)
     return replace(scene, objects=tuple(objects), extra={**scene.extra, "retrieval": found})
 

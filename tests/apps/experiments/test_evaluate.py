@@ -14,6 +14,7 @@ from sceneprior.apps.experiments.evaluate import evaluate_run, mask_scores
 from sceneprior.apps.rooms import write_scenes
 from sceneprior.apps.sample import sample_rooms
 from sceneprior.core.errors import InputError
+from sceneprior.core.scene import SceneObject
 from sceneprior.core.shards import iterate_rooms
 from sceneprior.evaluation.metrics.contents import class_counts
 from sceneprior.evaluation.synthesis import EvalOptions
@@ -109,6 +110,9 @@ def test_a_request_stands_in_the_protocol(toy_run, monkeypatch):
     for asked in ({"floor": "4x3", "want": "a desk"}, None):
         scores = evaluate_run(toy_run, 2, EvalOptions(), use=UseOptions(), asked=asked)
         assert scores["protocol"].get("request") == asked
+    given = {"objects": (SceneObject("desk", (0.0, 0.4, 0.0), (1.0, 0.8, 0.6)),)}
+    scores = evaluate_run(toy_run, 2, EvalOptions(), use=UseOptions(), asked=given)
+    assert "desk" in json.dumps(scores)
 
 
 def test_views_that_training_never_saw_are_held_out(toy_shards, toy_run):

@@ -216,10 +216,13 @@ def test_objects_without_a_model_keep_their_yaw(models, center_y):
 def test_objects_that_are_kept_keep_their_entry(models):
     sofas = [SceneObject("sofa", (3.0 * k, 0.4, 0.0), (2.0, 0.8, 1.2)) for k in range(2)]
     before = {"model_id": "of before", "turn_deg": 90, "distance_m": 0.5}
-    given = replace(room(*sofas), extra={"retrieval": [before]})
+    given = replace(room(*sofas), extra={"retrieval": [before, None]})
     first, second = retrieve(given, models, keep=[0]).extra["retrieval"]
     assert first == before and second["model_id"] == "plain"
     assert retrieve(given, models, keep=[1]).extra["retrieval"][1] is None  # it had no entry
+    for other in (None, 5, {"a": 1}, [before]):  # of a file that others wrote
+        odd = retrieve(replace(given, extra={"retrieval": other}), models, keep=[0])
+        assert odd.extra["retrieval"][0] is None
 
 
 def test_rooms_without_objects_and_objects_without_volume_have_defined_answers(models):

@@ -50,6 +50,7 @@ def make_batch(seed: int = 0) -> Batch:
         sides_clear=(uniform(rooms, VIEWS, objects, 4) < 0.7) & visible[..., None],
         image_size=SIZE,
         instance_ids=torch.randint(0, objects + 1, (rooms, VIEWS, 6, 8), generator=generator),
+        mask_step=4,
         room_ids=("a", "b", "c"),
     )
     centers = (uniform(rooms, SLOTS, 3) - 0.5) * torch.tensor([6.0, 1.5, 6.0]) + 1

@@ -105,8 +105,8 @@ def test_sharp_masks_are_the_thinned_pixels_of_whole_ones(batch, step):
     settings, every = ShapeConfig(epochs=1, sigma_px2=1e-9), (..., *thinned(step))
     found = []
     whole = torch.zeros(3, 6, *batch.views.image_size, dtype=torch.int64)
-    for ids in (whole, whole[every]):
-        views = replace(batch.views, instance_ids=ids)
+    for each, ids in ((1, whole), (step, whole[every])):
+        views = replace(batch.views, instance_ids=ids, mask_step=each)
         found.append(seen_masks(vertices_m, faces, views, settings) > 0.5)
     assert 0.005 < found[1].double().mean() < 0.5
     assert torch.equal(found[1], found[0][every])
