@@ -45,7 +45,7 @@ BUDGET = {
     "sceneprior/furniture": (591, 4),
     "sceneprior/render": (4618, 23),
     "sceneprior/training": (1565, 9),
-    "sceneprior/paper": (2758, 13),
+    "sceneprior/paper": (2749, 13),
     "sceneprior/lifted": (9107, 45),
     "sceneprior/baselines": (2933, 14),
     "sceneprior/evaluation": (4478, 21),

@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from sceneprior.core.settings import Section
 from sceneprior.training.method import TrainConfig
@@ -90,15 +90,6 @@ class StageConfig(LatentStageConfig):
     """On a single GPU, run the parts of a step whose shapes never change as CUDA graphs
     (`StaticStep`), unless `accumulate` is above 1. A loss that is not finite is then noticed one
     step later, and the last bits of sums differ. It has no effect on a CPU."""
-
-    @model_validator(mode="after")
-    def _latent_epochs_are_epochs(self) -> "StageConfig":
-        if self.latent_epochs > self.epochs:
-            raise ValueError(
-                f"latent_epochs is {self.latent_epochs}, but they are part of the stage's "
-                f"{self.epochs} epochs; raise epochs, or lower latent_epochs"
-            )
-        return self
 
 
 class LayoutConfig(StageConfig):

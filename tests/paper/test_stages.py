@@ -8,7 +8,6 @@ import torch
 from interrupting import CPU, interrupted
 from tiny_runs import tiny_config
 
-from sceneprior.core.errors import ConfigError
 from sceneprior.paper.stages import LayoutStage, ShapeStage
 from sceneprior.training import callbacks
 from sceneprior.training.fit import fit
@@ -93,8 +92,3 @@ def test_a_run_stopped_between_two_checkpoints_keeps_the_lowest_loss_too(
         fit(config, tmp_path / "run", trainer_options=CPU)
     kept, _ = trained(config, tmp_path / "run")
     assert all(torch.equal(kept[name], whole[name]) for name in whole)
-
-
-def test_epochs_of_the_latents_alone_are_part_of_the_stages(tmp_path):
-    with pytest.raises(ConfigError, match="latent_epochs is 9"):
-        tiny_config(tmp_path, layout__latent_epochs=9, layout__epochs=2)
