@@ -255,15 +255,15 @@ class Page:
 
     def _frame(self, client: "viser.ClientHandle") -> None:
         camera, view = client.camera, self._views.get(client.client_id, VIEWS[0])
+        if view == "Walk in":
+            eye, target = walker(self.shown.scene)
+        else:
+            points_m = room_points(self.shown.scene, self.shell == "walls")
+            eye, target = overview(points_m, view, camera.image_width, camera.image_height)
         with client.atomic():
-            camera.fov = FOV_RAD[view]
-            if view == "Walk in":
-                camera.position, camera.look_at = walker(self.shown.scene)
-            else:
-                points_m = room_points(self.shown.scene, self.shell == "walls")
-                camera.position, camera.look_at = overview(
-                    points_m, view, camera.image_width, camera.image_height
-                )
+            for aside in (1e-2, 0.0):  # viser does not send what equals an old report
+                camera.fov = FOV_RAD[view] + aside
+                camera.position, camera.look_at = eye + aside, target + aside
 
     # -- Work ----------------------------------------------------------------------------------
 

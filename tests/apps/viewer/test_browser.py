@@ -142,11 +142,14 @@ def test_a_room_is_asked_for_changed_and_saved(browser, tmp_path):
         wait_for(lambda: "retrieval" in page.shown.scene.extra, "no models")
         wait_for(lambda: "✓ a double bed" in words(browser), "no ticks")
 
+        (client,) = page.server.get_clients().values()
+        eyes = [client.camera.position.copy()]
+        # What the browser reports, since the server changes its own state at once.
+        client.camera.on_update(lambda camera: eyes.append(camera.position.copy()))
         for view in ("From above", "Walk in", "From outside"):
-            (client,) = page.server.get_clients().values()
-            eye = client.camera.position.copy()
+            eye = eyes[-1]
             click(browser, view)
-            wait_for(lambda: np.abs(client.camera.position - eye).max() > 0.5, f"not {view}")  # noqa: B023
+            wait_for(lambda: np.abs(eyes[-1] - eye).max() > 0.5, f"not {view}")  # noqa: B023
         open_tab(browser, "Save")
         folder = {"behavior": "allow", "downloadPath": str(tmp_path)}
         browser.execute_cdp_cmd("Page.setDownloadBehavior", folder)

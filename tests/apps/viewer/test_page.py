@@ -309,6 +309,28 @@ def test_views_show_the_room_above_the_drawer_of_a_phone(fake, view, size):
     assert (y > -slope * z).all() and (y < low * slope * z).all()
 
 
+class LateCamera(SimpleNamespace):
+    """A camera of viser's: what equals its state is not sent, and the browser's reports, here of
+    the first view forever, replace the state."""
+
+    def __setattr__(self, name: str, value):
+        first = self.first.setdefault(name, value)
+        if not np.allclose(first, value) or name not in self.sent:
+            self.sent[name] = value
+
+
+def test_a_view_reaches_a_browser_whose_reports_are_late(fake):
+    page, client = page_of(fake, ROOM), client_of(930, 796)
+    client.camera = LateCamera(first={}, sent={}, **vars(client.camera))
+    page.look("From outside", client)
+    expected = dict(client.camera.sent)
+    page.look("Walk in", client)
+    assert np.abs(client.camera.sent["position"] - expected["position"]).max() > 1
+    page.look("From outside", client)
+    for name in ("fov", "position", "look_at"):
+        np.testing.assert_allclose(client.camera.sent[name], expected[name], atol=1e-9)
+
+
 def test_a_dragged_piece_follows_the_pointer_on_the_floor(fake):
     page, dropped = page_of(fake, ROOM), []
     page.follow = lambda task: task()
