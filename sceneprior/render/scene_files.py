@@ -131,13 +131,13 @@ def scene_to_obj(
         return "", b""
     plain = tuple(replace(item, textured=()) for item in scene.objects)
     text, files = export_obj(
-        _trimesh_of(replace(scene, objects=plain), shell), include_normals=False,
-        return_texture=True, mtl_name=materials, header=None,
+        _trimesh_of(replace(scene, objects=plain), shell, rgba=lambda srgb: [*srgb, 255]),
+        include_normals=False, return_texture=True, mtl_name=materials, header=None,
     )  # fmt: skip
     return text + "\n", files[materials]
 
 
-def _trimesh_of(scene: Scene, shell: Mapping[str, Mesh]) -> Any:
+def _trimesh_of(scene: Scene, shell: Mapping[str, Mesh], rgba: Any = linear_rgba) -> Any:
     import trimesh
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
@@ -149,7 +149,7 @@ def _trimesh_of(scene: Scene, shell: Mapping[str, Mesh]) -> Any:
     ) -> None:
         surface = part.material or PBRMaterial(
             name=label,
-            baseColorFactor=linear_rgba(color),
+            baseColorFactor=rgba(color),
             metallicFactor=0.0,
             roughnessFactor=0.9,
             # A learned mesh may fold over itself, so its back faces are drawn. Walls are closed, or

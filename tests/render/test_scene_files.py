@@ -22,6 +22,8 @@ from sceneprior.core.scene import (
     quarter_turned,
 )
 from sceneprior.core.scene_json import scene_to_json
+from sceneprior.render.appearance import linear_rgba, object_colors
+from sceneprior.render.model_files import load_parts
 from sceneprior.render.scene_files import (
     load_scene,
     load_scene_folder,
@@ -50,6 +52,15 @@ def scene() -> Scene:
         ),
         extra={"seed": 3},
     )
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".obj"])
+def test_models_read_from_a_saved_room_have_its_colours(scene, suffix, tmp_path):
+    save(scene, tmp_path / f"room{suffix}")
+    parts = load_parts(tmp_path / f"room{suffix}", suffix[1:], with_materials=True)
+    read = [[*map(float, part.material.baseColorFactor[:3])] for part in parts.values()]
+    colors = [255 * np.array(linear_rgba(color)[:3]) for color in object_colors(scene)]
+    np.testing.assert_allclose(sorted(read), sorted(map(list, colors)), atol=1)
 
 
 def test_the_glb_says_what_it_shows(scene):
