@@ -40,14 +40,14 @@ MAY_TOO = {
 }
 
 BUDGET = {
-    "data_prep": (12789, 60),
-    "sceneprior/core": (6714, 30),
+    "data_prep": (12798, 60),
+    "sceneprior/core": (6724, 30),
     "sceneprior/furniture": (591, 4),
     "sceneprior/render": (4618, 23),
     "sceneprior/training": (1565, 9),
     "sceneprior/paper": (2749, 13),
-    "sceneprior/lifted": (9107, 45),
-    "sceneprior/baselines": (2933, 14),
+    "sceneprior/lifted": (9102, 45),
+    "sceneprior/baselines": (2923, 14),
     "sceneprior/evaluation": (4478, 21),
     "sceneprior/interchange": (928, 5),
     "sceneprior/apps": (7407, 42),

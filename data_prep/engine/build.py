@@ -76,7 +76,7 @@ def build_shards(job: Job) -> Summary:
             with writing(out):
                 write_json(out / PLAN_NAME, asdict(plan))
         elif job.retry_failed and any(line.status == "failed" for line in plan.left_out):
-            plan = plan.joined(source.survey(), source.only)
+            plan = plan.joined(source.survey(), source.only, settings)
             with writing(out):
                 write_json(out / PLAN_NAME, asdict(plan))
         return _carry_out(replace(job, out=out), plan)

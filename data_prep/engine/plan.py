@@ -4,7 +4,7 @@ import hashlib
 import json
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,11 +14,11 @@ from pydantic import TypeAdapter
 from data_prep.engine.source import Line, RoomTask, Source, Survey
 from sceneprior.core.checked import plain
 from sceneprior.core.errors import InputError
-from sceneprior.core.files import file_stamp, list_files, read_table, reading
+from sceneprior.core.files import list_files, read_table, reading
 from sceneprior.core.shards import INDEX_NAME, SPLITS
 
 PLAN_NAME = "plan.json"
-PLAN_VERSION = 3
+PLAN_VERSION = 4
 ROOMS_PER_SHARD = 8
 
 
@@ -40,15 +40,16 @@ class JobPlan:
     """All work of a run, and of later runs in the same folder."""
 
     settings: dict[str, Any]
-    """Settings of the source, and the type of renderer (None if nothing is drawn)."""
+    """Settings of the source, and the type of renderer (None if nothing is drawn). Of a mapping, as
+    from houses to the sizes of their files, houses that the survey could not read do not count."""
     rooms: tuple[RoomTask, ...]
     left_out: tuple[Line, ...]
     """Rooms that the survey left out."""
 
-    def joined(self, survey: Survey, only: str | None) -> "JobPlan":
+    def joined(self, survey: Survey, only: str | None, settings: dict[str, Any]) -> "JobPlan":
         """The plan with the rooms of a later survey that the first one left out, at the end.
 
-        `only` is that of the later survey.
+        `only` and `settings` are those of the later survey.
         """
         known = {room.room_id for room in self.rooms}
         for line in survey.left_out:  # such as rooms of another image size than most have now
@@ -61,7 +62,11 @@ class JobPlan:
         others = (
             line for line in self.left_out if not is_asked_for(only, line.room_id, line.house)
         )
-        return JobPlan(self.settings, (*self.rooms, *new), (*others, *survey.left_out))
+        now = {
+            key: value | settings.get(key, {}) if isinstance(value, dict) else value
+            for key, value in self.settings.items()
+        }
+        return JobPlan(now, (*self.rooms, *new), (*others, *survey.left_out))
 
     def shards(self, room_type: str) -> list[ShardTask]:
         """Group the rooms of each split, in order, into shards of `ROOMS_PER_SHARD`."""
@@ -101,7 +106,14 @@ def read_plan(out: Path, source: Source, settings: dict[str, Any], renderer: str
         plan = TypeAdapter(JobPlan).validate_python(data)
     if source.only is not None and before.get("only", "") is None:
         settings = job_settings(source, None)
-    changed = [key for key in settings if before.get(key) != settings[key]]
+    lost = {line.house for line in plan.left_out if line.status == "failed"}
+
+    def counted(value: Any) -> Any:
+        if not isinstance(value, dict):
+            return value
+        return {key: value[key] for key in value if key not in lost}
+
+    changed = [key for key in settings if counted(before.get(key)) != counted(settings[key])]
     if source.draws and renderer not in ("auto", drawn_with):
         changed.append("renderer")
     if changed:
@@ -115,11 +127,6 @@ def read_plan(out: Path, source: Source, settings: dict[str, Any], renderer: str
 def digest(text: str) -> str:
     """Hash a long setting to a short fingerprint."""
     return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-def digest_of_files(paths: Sequence[Path]) -> str:
-    """Fingerprint of names and sizes: quick, and enough to notice another release."""
-    return digest("".join(f"{path.name} {file_stamp(path)[1]}\n" for path in paths))
 
 
 def house_may_match(only: str | None, house: str) -> bool:

@@ -9,7 +9,6 @@ from typing import Any, ClassVar
 
 from data_prep.engine.plan import (
     digest,
-    digest_of_files,
     house_may_match,
     read_splits,
     seeded_split,
@@ -72,8 +71,9 @@ class FrontSource:
             "recipe": recipe,
             "seed": self.seed,
             "splits": None if self.splits is None else digest(read_text(self.splits)),
-            "houses": digest_of_files(self._houses(only)),
-            "models": digest_of_files([info]),
+            # Sizes: quick to find, and enough to notice another release.
+            "houses": {path.stem: file_stamp(path)[1] for path in self._houses(only)},
+            "models": file_stamp(info)[1],
         }
 
     def survey(self) -> Survey:

@@ -9,13 +9,14 @@ from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
-from pydantic import Field, model_validator
+from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sceneprior.baselines.decoders import EncoderConfig
 from sceneprior.baselines.one_stage import BoxConfig, OneStage, OneStageTraining, room_means
 from sceneprior.core.mixtures import draw_index
+from sceneprior.core.settings import AttentionSection
 from sceneprior.core.views import RoomBoxes
 from sceneprior.paper.decoders import mlp
 from sceneprior.training.steps import batch_seed, full_precision
@@ -87,19 +88,13 @@ BATCH = 256
 """Rooms per batch in sampling."""
 
 
-class SetModel(EncoderConfig):
+class SetModel(EncoderConfig, AttentionSection):
     """Size of a network that generates sets of objects: ATISS or the set flow."""
 
     max_objects: int = Field(ge=1, le=1000)
     """Maximum number of objects in a sampled room."""
     width: int = Field(512, ge=8)
     """Width of the encoder and of the hidden layers."""
-
-    @model_validator(mode="after")
-    def _heads_divide_width(self) -> "SetModel":
-        if self.width % self.heads:
-            raise ValueError(f"width {self.width} is not a multiple of heads {self.heads}")
-        return self
 
 
 class AtissModel(SetModel):

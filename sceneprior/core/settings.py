@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar, get_args
 
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from sceneprior.core.errors import ConfigError, shortened
 from sceneprior.core.files import read_text, write_whole
@@ -43,6 +43,16 @@ class Section(BaseModel):
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, use_attribute_docstrings=True
     )
+
+
+class AttentionSection(Section):
+    # `width` and `heads` are fields of its subclasses.
+    @model_validator(mode="after")
+    def _heads_divide_width(self) -> "AttentionSection":
+        width, heads = (getattr(self, name) for name in ("width", "heads"))
+        if width % heads:
+            raise ValueError(f"width {width} is not a multiple of heads {heads}")
+        return self
 
 
 _S = TypeVar("_S", bound=Section)

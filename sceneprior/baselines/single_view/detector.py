@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from pydantic import Field, model_validator
+from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.nn.utils.rnn import pad_sequence
@@ -29,6 +29,7 @@ from sceneprior.baselines.single_view.detections import (
 from sceneprior.core.boxes import box_corners
 from sceneprior.core.dataset import ViewDataset
 from sceneprior.core.ground_truth import reference_scene
+from sceneprior.core.settings import AttentionSection
 from sceneprior.core.shards import iterate_rooms
 from sceneprior.core.surfaces import surface_points
 from sceneprior.core.views import SceneViews
@@ -128,17 +129,11 @@ def filled(points: Float[np.ndarray, "points 3"], cells: int) -> Bool[np.ndarray
     return surface | between
 
 
-class DetectorModel(SingleViewModel):
+class DetectorModel(SingleViewModel, AttentionSection):
     """Size of a network with a detector."""
 
     heads: int = Field(4, ge=1)
     """Attention heads over pairs of masks; must divide `width`."""
-
-    @model_validator(mode="after")
-    def _heads_share_the_width(self) -> "DetectorModel":
-        if self.width % self.heads:
-            raise ValueError(f"width {self.width} is not a multiple of heads {self.heads}")
-        return self
 
 
 class DetectorTraining(SingleViewTraining):

@@ -6,11 +6,12 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
-from pydantic import Field, model_validator
+from pydantic import Field
 from torch import Tensor, nn
 
 from sceneprior.core.boxes import QUARTERS
 from sceneprior.core.mixtures import LogisticMixture, draw_index
+from sceneprior.core.settings import AttentionSection
 from sceneprior.lifted.lifting import HANGS_M
 from sceneprior.lifted.prototypes import POSES, PosedRooms, turn_posed
 from sceneprior.lifted.sampler.contents import MANY, Contents, PairwisePotentials, reached
@@ -47,7 +48,7 @@ OWN_POSE = turn_posed(
 """Maps (room symmetry, observed pose) to the pose in the untransformed room."""
 
 
-class SamplerConfig(TrainConfig):
+class SamplerConfig(TrainConfig, AttentionSection):
     """Training and size of the sampler: the section `sampler` of a run's YAML."""
 
     batch_size: int = Field(64, ge=1)
@@ -68,12 +69,6 @@ class SamplerConfig(TrainConfig):
     val_every: int = Field(10, ge=1)
     """Epochs between evaluations on the val rooms. The network that gives them the highest
     likelihood is kept, or the newest network if there are no val rooms."""
-
-    @model_validator(mode="after")
-    def _heads_divide_width(self) -> "SamplerConfig":
-        if self.width % self.heads:
-            raise ValueError(f"width {self.width} is not a multiple of heads {self.heads}")
-        return self
 
 
 class EncoderState(NamedTuple):

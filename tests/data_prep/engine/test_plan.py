@@ -35,6 +35,26 @@ def test_other_settings_want_another_folder(front, tmp_path):
         build_shards(front_job(front, out))
 
 
+def test_a_damaged_house_is_downloaded_again_and_retried(front, tmp_path):
+    three_houses(front)
+    damaged, out = front.front / "house1.json", tmp_path / "shards"
+    whole = damaged.read_text()
+    damaged.write_text(whole[:200])
+    first = build_shards(front_job(front, out))
+    assert first.statuses == {"prepared": 4, "failed": 1}
+    before = rooms_of(out)
+    damaged.write_text(whole)
+    assert build_shards(front_job(front, out)).statuses == first.statuses
+    again = build_shards(front_job(front, out, retry_failed=True))
+    assert again.statuses == {"prepared": 6}
+    assert set(rooms_of(out)) == {*before, "house1_Bedroom-1", "house1_MasterBedroom-1"}
+    assert build_shards(front_job(front, out, retry_failed=True)).shards_made == 0
+    # Once read, it counts as the others do.
+    damaged.write_text(whole + "\n")
+    with refused("engine/other houses", tmp=tmp_path):
+        build_shards(front_job(front, out, retry_failed=True))
+
+
 def test_only_works_on_a_part_of_a_folder_that_was_begun_for_everything(front, tmp_path):
     front.house("house", *(bedroom(f"Bedroom-{k}") for k in range(20)))
     out = tmp_path / "shards"
