@@ -40,8 +40,8 @@ MAY_TOO = {
 }
 
 BUDGET = {
-    "data_prep": (12798, 60),
-    "sceneprior/core": (6724, 30),
+    "data_prep": (12797, 60),
+    "sceneprior/core": (6725, 30),
     "sceneprior/furniture": (591, 4),
     "sceneprior/render": (4618, 23),
     "sceneprior/training": (1565, 9),

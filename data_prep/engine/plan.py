@@ -40,8 +40,9 @@ class JobPlan:
     """All work of a run, and of later runs in the same folder."""
 
     settings: dict[str, Any]
-    """Settings of the source, and the type of renderer (None if nothing is drawn). Of a mapping, as
-    from houses to the sizes of their files, houses that the survey could not read do not count."""
+    """Settings of the source, and the type of renderer (None if nothing is drawn). `houses`, if
+    present, has the size of each house's file; of houses that the survey could not read, sizes are
+    not compared."""
     rooms: tuple[RoomTask, ...]
     left_out: tuple[Line, ...]
     """Rooms that the survey left out."""
@@ -62,10 +63,9 @@ class JobPlan:
         others = (
             line for line in self.left_out if not is_asked_for(only, line.room_id, line.house)
         )
-        now = {
-            key: value | settings.get(key, {}) if isinstance(value, dict) else value
-            for key, value in self.settings.items()
-        }
+        before = self.settings.get("houses", {})
+        sizes = {name: before[name] for name in before if not house_may_match(only, name)}
+        now = self.settings | {"houses": sizes | settings.get("houses", {})}
         return JobPlan(now, (*self.rooms, *new), (*others, *survey.left_out))
 
     def shards(self, room_type: str) -> list[ShardTask]:
@@ -80,13 +80,13 @@ class JobPlan:
 
 
 def job_settings(source: Source, only: str | None) -> dict[str, Any]:
-    """Settings that must be equal for a run to resume in a folder, except the renderer."""
+    """Settings that `read_plan` compares, all but the renderer."""
     settings = {"plan_version": PLAN_VERSION, "source": source.name, "only": only}
     return json.loads(json.dumps(settings | source.settings(only)))
 
 
 def read_plan(out: Path, source: Source, settings: dict[str, Any], renderer: str) -> JobPlan | None:
-    """Read the plan of an earlier run with the same `job_settings`; None if there was none.
+    """Read the plan of an earlier run with the same settings; None if there was none.
 
     `--renderer auto` resumes with the renderer of that run; `--only` may work on part of a folder
     that was begun without it.
@@ -107,13 +107,12 @@ def read_plan(out: Path, source: Source, settings: dict[str, Any], renderer: str
     if source.only is not None and before.get("only", "") is None:
         settings = job_settings(source, None)
     lost = {line.house for line in plan.left_out if line.status == "failed"}
-
-    def counted(value: Any) -> Any:
-        if not isinstance(value, dict):
-            return value
-        return {key: value[key] for key in value if key not in lost}
-
-    changed = [key for key in settings if counted(before.get(key)) != counted(settings[key])]
+    lost -= {room.house for room in plan.rooms}
+    settings = dict(settings)
+    for values in (before, settings):  # a lost house may have been replaced
+        sizes = values.get("houses", {})
+        values["houses"] = {name: sizes[name] for name in sizes if name not in lost}
+    changed = [key for key in settings if before.get(key) != settings[key]]
     if source.draws and renderer not in ("auto", drawn_with):
         changed.append("renderer")
     if changed:

@@ -119,8 +119,8 @@ class Source(Protocol):
         """Settings that the shards' bytes depend on, as JSON, without paths.
 
         Called first, in the main process, so it also rejects wrong folders. A run may resume in a
-        folder only if its settings are equal. `index.json` repeats `recipe` and `seed`. `only` is
-        the value of `--only` to assume: the source's own, or None for everything.
+        folder only if its settings are equal (`read_plan`). `index.json` repeats `recipe` and
+        `seed`. `only` is the value of `--only` to assume: the source's own, or None for everything.
         """
 
     def survey(self) -> Survey:

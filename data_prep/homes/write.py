@@ -37,7 +37,7 @@ def write_model(folder: Path, model: Model) -> None:
     home = folder / model.jid
     home.mkdir(parents=True)
     # Sines differ in their last bits from CPU to CPU, and halves of sizes end with 0.00005.
-    vertices_m = np.round(model.mesh.vertices, 9).tolist()
+    vertices_m = (np.round(model.mesh.vertices, 9) + 0.0).tolist()
     lines = [f"v {x:.4f} {y:.4f} {z:.4f}" for x, y, z in vertices_m]
     lines += [f"f {a} {b} {c}" for a, b, c in (model.mesh.faces + 1).tolist()]
     (home / "raw_model.obj").write_text("\n".join(lines) + "\n")

@@ -46,7 +46,8 @@ class Section(BaseModel):
 
 
 class AttentionSection(Section):
-    # `width` and `heads` are fields of its subclasses.
+    """Settings with fields `width` and `heads`."""
+
     @model_validator(mode="after")
     def _heads_divide_width(self) -> "AttentionSection":
         width, heads = (getattr(self, name) for name in ("width", "heads"))

@@ -37,22 +37,63 @@ def test_other_settings_want_another_folder(front, tmp_path):
 
 def test_a_damaged_house_is_downloaded_again_and_retried(front, tmp_path):
     three_houses(front)
-    damaged, out = front.front / "house1.json", tmp_path / "shards"
-    whole = damaged.read_text()
+    damaged, sound = front.front / "house1.json", front.front / "house0.json"
+    out, whole, other = tmp_path / "shards", damaged.read_text(), sound.read_text()
     damaged.write_text(whole[:200])
     first = build_shards(front_job(front, out))
     assert first.statuses == {"prepared": 4, "failed": 1}
     before = rooms_of(out)
     damaged.write_text(whole)
     assert build_shards(front_job(front, out)).statuses == first.statuses
+
+    def others_are_refused(path, text):
+        path.write_text(text + "\n")
+        for is_retried in (False, True):
+            with refused("engine/other houses", tmp=tmp_path):
+                build_shards(front_job(front, out, retry_failed=is_retried))
+        path.write_text(text)
+
+    others_are_refused(sound, other)
+    room_alone = {"only": "house1/Bedroom-1", "retry_failed": True}
+    assert build_shards(front_job(front, out, **room_alone)).statuses == {"prepared": 1}
+    others_are_refused(damaged, whole)
     again = build_shards(front_job(front, out, retry_failed=True))
     assert again.statuses == {"prepared": 6}
     assert set(rooms_of(out)) == {*before, "house1_Bedroom-1", "house1_MasterBedroom-1"}
     assert build_shards(front_job(front, out, retry_failed=True)).shards_made == 0
-    # Once read, it counts as the others do.
-    damaged.write_text(whole + "\n")
+    others_are_refused(damaged, whole)
+
+
+def test_a_house_with_sound_rooms_may_not_change(front, tmp_path):
+    three_houses(front)
+    path, out = front.front / "house1.json", tmp_path / "shards"
+    house = json.loads(path.read_text())
+    house["scene"]["room"].append(3)
+    path.write_text(json.dumps(house))
+    assert build_shards(front_job(front, out)).statuses == {"prepared": 6, "failed": 1}
+    path.write_text(json.dumps(house) + "\n")
     with refused("engine/other houses", tmp=tmp_path):
-        build_shards(front_job(front, out, retry_failed=True))
+        build_shards(front_job(front, out))
+
+
+def test_a_damaged_house_may_be_deleted(front, tmp_path):
+    three_houses(front)
+    path, out = front.front / "house1.json", tmp_path / "shards"
+    path.write_text("{")
+    build_shards(front_job(front, out))
+    path.unlink()
+    for is_retried in (False, True, False):
+        summary = build_shards(front_job(front, out, retry_failed=is_retried))
+    assert summary.statuses == {"prepared": 4}
+
+
+def test_other_settings_are_refused_beside_a_damaged_file(front, tmp_path):
+    three_houses(front)
+    (front.front / "views.json").write_text("{")
+    build_shards(front_job(front, tmp_path / "shards"))
+    with refused("engine/other recipe and renderer", tmp=tmp_path):
+        job = {"rules": ("views.per_m2=3",), "renderer": "pyrender"}
+        build_shards(front_job(front, tmp_path / "shards", **job))
 
 
 def test_only_works_on_a_part_of_a_folder_that_was_begun_for_everything(front, tmp_path):
